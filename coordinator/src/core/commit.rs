@@ -224,6 +224,7 @@ impl Core {
         );
         self.stop_first(session, range);
         self.perhaps_over(id, now_ms);
+        self.settle_for_others(id, task, now_ms);
     }
 
     /// Tells the holder of a lease to stop if the second run of its last task finished first.

@@ -63,13 +63,17 @@ impl Core {
     }
 
     /// Returns the precedence of a stage: higher priority first, then the user with the fewest
-    /// leases, then the job with the fewest leases, then the earlier submission.
+    /// leases, then the job with the fewest leases, then the earlier submission. Of users, and of
+    /// jobs, with as many leases, the one that got a lease longest ago is first, because a single
+    /// worker has no lease each time it asks.
     pub(super) fn rank(&self, id: StageRef) -> impl Ord + use<> {
         let job = self.stages[&id].job();
         (
             Reverse(job.spec.priority),
             self.load.leases_of_user(&job.user),
+            self.load.turn_of_user(&job.user),
             self.load.leases_of_job(job.id),
+            self.load.turn_of_job(job.id),
             id,
         )
     }

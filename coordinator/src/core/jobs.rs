@@ -38,7 +38,7 @@ impl Core {
     }
 
     /// Takes back the tasks of a job's leases that their workers have not begun, as far as is
-    /// known. A worker runs one task at a time and works through a lease in order.
+    /// known. A worker begins the tasks of a lease in order.
     fn return_waiting(&mut self, job: JobId) {
         let stages = self.stages.iter().filter(|(id, _)| id.job == job);
         let leases = stages.flat_map(|(_, entry)| entry.held.leased());
@@ -98,6 +98,7 @@ impl Core {
                 entry.held.give_pending(self.outcome.changes());
             }
         }
+        self.load.job_removed(job);
     }
 
     /// Makes the given-up tasks of an active job pending again.

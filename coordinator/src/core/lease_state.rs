@@ -112,8 +112,8 @@ impl Core {
         tasks
     }
 
-    /// Returns the tasks of a lease that its worker has begun, as far as is known. A worker runs
-    /// one at a time.
+    /// Returns the tasks of a lease that its worker has begun, as far as is known. While a worker
+    /// runs tasks of another lease, it has usually begun none of this one.
     pub(super) fn begun_tasks(&self, range: &Range) -> Vec<u64> {
         let runs = |id: &RangeId| self.leases.is_running(*id);
         let RangeState::Leased(lease) = &range.state else {

@@ -11,6 +11,11 @@ pub(super) struct Load {
     leases: HashMap<RangeId, (JobId, WorkerId)>,
     jobs: HashMap<JobId, JobLoad>,
     users: HashMap<String, u32>,
+    /// Number of leases that began.
+    turn: u64,
+    /// The turn at which each active job, and each user, got the last lease or joined.
+    turns_of_jobs: HashMap<JobId, u64>,
+    turns_of_users: HashMap<String, u64>,
     /// Workers of other instances by job, as last reported.
     elsewhere: BTreeMap<JobId, u32>,
 }
@@ -33,6 +38,32 @@ impl Load {
         load.leases += 1;
         *load.workers.entry(worker).or_default() += 1;
         *self.users.entry(job.user.clone()).or_default() += 1;
+        self.turn += 1;
+        self.turns_of_jobs.insert(job.id, self.turn);
+        self.turns_of_users.insert(job.user.clone(), self.turn);
+    }
+
+    /// Adds an active job. It queues behind those that wait already.
+    pub(super) fn job_added(&mut self, job: &Job) {
+        self.turns_of_jobs.entry(job.id).or_insert(self.turn);
+        self.turns_of_users
+            .entry(job.user.clone())
+            .or_insert(self.turn);
+    }
+
+    /// Removes a job that is no longer active.
+    pub(super) fn job_removed(&mut self, job: JobId) {
+        self.turns_of_jobs.remove(&job);
+    }
+
+    /// Returns when a job got its last lease, counted in leases.
+    pub(super) fn turn_of_job(&self, job: JobId) -> u64 {
+        self.turns_of_jobs.get(&job).copied().unwrap_or(0)
+    }
+
+    /// Returns when a user got the last lease, counted in leases.
+    pub(super) fn turn_of_user(&self, user: &str) -> u64 {
+        self.turns_of_users.get(user).copied().unwrap_or(0)
     }
 
     /// Removes a lease that has ended.

@@ -4,13 +4,14 @@
 //!
 //! This instance knows the tasks of its own workers, and those of other instances' workers as of
 //! the last news (once a second). A task not yet reported runs twice and gives the same bytes.
-//! Results that others have finished are found when tasks are claimed, and again by the worker that
+//! A result also settles the claimed tasks of the other jobs that want it. Results that other
+//! instances' workers have finished are found when tasks are claimed, and again by the worker that
 //! begins a task.
 
 use picofarm_catalog::{Mark, Run};
-use picofarm_proto::ids::StageRef;
+use picofarm_proto::{ids::StageRef, messages::EventKind};
 
-use super::state::Core;
+use super::{history::EventDetails, state::Core, transition::RangeEvent};
 
 impl Core {
     /// Returns the tasks of a stage that workers run for other stages with the same outputs, as
@@ -24,7 +25,7 @@ impl Core {
         let others = || sharing.iter().filter(|other| **other != id);
         let here = others().flat_map(|other| self.stages[other].held.leased());
         let here = here.filter_map(|(range, lease)| {
-            // A lease is worked through in order.
+            // The tasks of a lease are begun in order.
             let first = lease.marks.iter().position(|m| *m == Mark::Todo)?;
             Some(Run {
                 lo: range.lo + first as u64,
@@ -35,6 +36,36 @@ impl Core {
         let mut runs: Vec<Run> = here.chain(elsewhere.copied()).collect();
         in_order(&mut runs);
         runs
+    }
+
+    /// Settles a task, which a worker finished for the stage `by`, in the other stages that want the
+    /// same output and have claimed the task. Without this, jobs that take turns over one data set
+    /// would each run all of it.
+    pub(super) fn settle_for_others(&mut self, by: StageRef, task: u64, now_ms: i64) {
+        let sharing = self.stages.sharing(&self.stages[&by]);
+        if sharing.len() < 2 {
+            return;
+        }
+        let others: Vec<StageRef> = sharing.iter().copied().filter(|id| *id != by).collect();
+        for id in others {
+            let entry = self.stages.get_mut(&id).expect("a set names active stages");
+            if entry.spec().force {
+                continue;
+            }
+            let Some(range) = entry.held.pending_at(task).cloned() else {
+                continue;
+            };
+            let run = Run {
+                lo: task,
+                hi: task + 1,
+            };
+            self.outcome
+                .apply(&mut entry.held, &range, &RangeEvent::Settle { run })
+                .expect("a pending task can be settled");
+            let about = EventDetails::message("another job made the output").tasks(run.lo, run.hi);
+            self.outcome.event(now_ms, id, EventKind::Reused, about);
+            self.perhaps_over(id, now_ms);
+        }
     }
 
     /// Returns how many tasks of a stage wait only because they run for other stages.

@@ -101,6 +101,7 @@ impl Core {
         timings: &HashMap<ResultSet, Timing>,
     ) {
         self.stages.add_job(job, stages, timings);
+        self.load.job_added(job);
     }
 
     /// Opens stages that may begin and removes jobs that have ended.
@@ -114,6 +115,7 @@ impl Core {
         for end in &settled.ends {
             tracing::info!(job = %end.job, state = ?end.state, "job ended");
             self.stages.remove_job(end.job);
+            self.load.job_removed(end.job);
         }
     }
 

@@ -100,6 +100,10 @@ impl Core {
         if lease.marks[from..].iter().any(|m| *m != Mark::Todo) {
             return false;
         }
+        // Small tasks run side by side, so that the holder may have begun these, too.
+        if self.leases.running(range.id).any(|(task, _)| task >= at) {
+            return false;
+        }
         let (range, holder) = (range.clone(), lease.worker);
         if let Some(entry) = self.workers.get(&holder) {
             let trim = ToWorker::Trim {

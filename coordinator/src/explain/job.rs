@@ -78,7 +78,7 @@ pub fn job(facts: &JobFacts) -> Vec<Reason> {
     reasons
 }
 
-/// Describes the leased tasks. A worker runs one task of a lease at a time.
+/// Describes the leased tasks. A worker runs a few tasks of a lease at a time, mostly one.
 fn leased_words(facts: &JobFacts) -> String {
     const SHOWN: usize = 4;
     let under = format!("{} under lease at workers", n(facts.counts.leased, "task"));

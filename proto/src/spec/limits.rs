@@ -103,8 +103,8 @@ impl Limits {
     }
 }
 
-/// The resources that a worker must have to run a stage's tasks. A worker runs one task at a time
-/// with all its resources.
+/// The resources that a worker must have to run a stage's tasks. A task may use all of them, and
+/// several small tasks of a stage share the cores.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Resources {

@@ -16,6 +16,7 @@ use picofarm_dataset::Manifest;
 use picofarm_dataset::{PartName, SMALL};
 use picofarm_store::StorageError;
 use picofarm_store::concurrent::CONCURRENCY;
+use picofarm_store::get_sized;
 use picofarm_store::objects;
 use picofarm_store::sealed::ObjectEntry;
 
@@ -226,16 +227,25 @@ impl Holdings {
         }
         let size = named.objects.iter().map(|object| object.size).sum::<u64>();
         let small = named.provenance.is_some() && size <= SMALL;
-        for object in named.objects.iter().filter(|_| thorough) {
-            let path = objects::path_of(folder, &object.key);
-            if objects::size(&*self.store, &path).await? != Some(object.size) {
-                return Ok(Held::Gone);
+        let path = |object: &ObjectEntry| objects::path_of(folder, &object.key);
+        if small && thorough {
+            let objects = named.objects.iter();
+            let sized: Vec<_> = objects.map(|object| (path(object), object.size)).collect();
+            let found = get_sized(&*self.store, &sized).await?;
+            for (object, bytes) in named.objects.iter().zip(found) {
+                match bytes {
+                    None => return Ok(Held::Gone),
+                    Some(bytes) if hex::encode(digest(&bytes)) != object.sha256 => {
+                        return Ok(Held::Other);
+                    }
+                    Some(_) => {}
+                }
             }
-            if small
-                && let Some(bytes) = objects::get(&*self.store, &path).await?
-                && hex::encode(digest(&bytes)) != object.sha256
-            {
-                return Ok(Held::Other);
+            return Ok(Held::Equal);
+        }
+        for object in named.objects.iter().filter(|_| thorough) {
+            if objects::size(&*self.store, &path(object)).await? != Some(object.size) {
+                return Ok(Held::Gone);
             }
         }
         Ok(Held::Equal)

@@ -81,7 +81,7 @@ impl Guarded {
 
 impl fmt::Display for Guarded {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.0.store)
+        write!(f, "guarded {}", self.0.store)
     }
 }
 

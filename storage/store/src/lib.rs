@@ -25,13 +25,13 @@ pub mod sealed;
 mod service;
 #[cfg(feature = "clouds")]
 mod steady;
+mod together;
 pub mod verify;
 mod writable;
 
 use std::sync::Arc;
 
 use object_store::ObjectStore;
-use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 
 pub use bandwidth::{Bandwidth, limit_bandwidth};
@@ -44,10 +44,12 @@ pub use local::{leftovers, probe_leftovers};
 pub use objects::publish_files;
 pub use probe::{PROBE, PROBE_WITHIN, probe};
 pub use sealed::{ObjectEntry, sha256_hex};
+pub use together::get_sized;
 pub use verify::{Fault, Problem, RecordKind, Remedy, Verification, VerifyMode, Watch};
 pub use writable::{Writable, check_writable, local_ground};
 
 use bucket_url::BucketUrl;
+use together::FolderStore;
 
 /// Returns the store, and the prefix in it, for a local path, a `file://` URL,
 /// `s3://bucket/prefix`, `gs://bucket/prefix` (Google) or `az://container/prefix` (Azure). The
@@ -87,7 +89,7 @@ pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), Sto
         url: url_or_path.to_string(),
         what: format!("cannot be the prefix of object keys: {e}"),
     })?;
-    Ok((Arc::new(LocalFileSystem::new().with_fsync(true)), prefix))
+    Ok((Arc::new(FolderStore::new()), prefix))
 }
 
 /// Checks that a location can be parsed. Does not check whether it can be reached.

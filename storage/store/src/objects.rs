@@ -10,6 +10,7 @@ use object_store::{Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions, Upda
 use crate::error::StorageError;
 use crate::failure::no_bucket;
 use crate::sealed::sha256_hex;
+use crate::together::create_last;
 
 /// Number of attempts to create an object that the store reports as existing although it is
 /// missing.
@@ -84,7 +85,7 @@ pub fn shown(store: &dyn ObjectStore, path: &Path) -> String {
 
 /// Returns the folder of a path in a local store; `None` for other stores.
 pub fn folder(store: &dyn ObjectStore, path: &Path) -> Option<std::path::PathBuf> {
-    let local = store.to_string().starts_with("LocalFileSystem(file://");
+    let local = store.to_string().contains("LocalFileSystem(file://");
     local.then(|| shown(store, path).into())
 }
 
@@ -123,9 +124,33 @@ pub async fn create_or_match(
     path: &Path,
     bytes: Bytes,
 ) -> Result<(), StorageError> {
+    create_or_match_by(store, path, &bytes, || create(store, path, bytes.clone())).await
+}
+
+/// Like [`create_or_match`], for an object that refers to `objects`: these exist, and are durable
+/// before it can be seen.
+///
+/// # Errors
+/// Those of [`create_or_match`].
+pub(crate) async fn create_last_or_match(
+    store: &dyn ObjectStore,
+    objects: &[(Path, Bytes)],
+    path: &Path,
+    bytes: Bytes,
+) -> Result<(), StorageError> {
+    let create = || create_last(store, objects, (path, bytes.clone()));
+    create_or_match_by(store, path, &bytes, create).await
+}
+
+async fn create_or_match_by<F: Future<Output = Result<bool, StorageError>>>(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: &Bytes,
+    create: impl Fn() -> F,
+) -> Result<(), StorageError> {
     let mut found = None;
     for _ in 0..ATTEMPTS {
-        if create(store, path, bytes.clone()).await? {
+        if create().await? {
             return Ok(());
         }
         // The server's own checksum is not trusted: read the object back.
@@ -145,10 +170,10 @@ pub async fn create_or_match(
             account: format!("refused {ATTEMPTS} times as existing, but it does not exist"),
         });
     };
-    if stored == bytes {
+    if stored == *bytes {
         return Ok(());
     }
-    let (stored, ours) = (sha256_hex(&stored), sha256_hex(&bytes));
+    let (stored, ours) = (sha256_hex(&stored), sha256_hex(bytes));
     tracing::error!(object = %path, %stored, %ours, "conflict: an object exists with other bytes");
     Err(StorageError::Conflict {
         object: shown(store, path),

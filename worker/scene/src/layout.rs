@@ -103,6 +103,12 @@ impl Room {
         }
     }
 
+    /// Returns the smallest and largest coordinates of the room.
+    pub(crate) fn corners(&self) -> [Vec3; 2] {
+        let (x, z) = (self.width * 0.5, self.depth * 0.5);
+        [Vec3::new(-x, 0.0, -z), Vec3::new(x, self.height, z)]
+    }
+
     /// Returns the six inner faces, each a separate mesh facing inwards, with its label.
     pub(crate) fn shell(
         &self,

@@ -6,6 +6,7 @@
 
 mod assets;
 mod body;
+mod box_view;
 mod camera;
 pub mod export;
 mod extras;

@@ -9,12 +9,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     Affine, Aim, Camera, Intrinsics, Material, Mesh, Object, Provenance, Scene, SceneError, Vec3,
+    box_view::depths_in_box,
     label::{label_id, vocabulary},
     layout::{Footprint, Room},
     rng::Rng,
     shape::Shape,
     trace::{Model, World},
-    view::{acceptance, beams_land, coarse_view, full_view},
+    view::{acceptance, beams_land, coarse_view},
 };
 
 /// Changes whenever the same seed would give another scene.
@@ -24,6 +25,8 @@ pub const GENERATOR_VERSION: &str = "primitive-2";
 const ATTEMPTS: u32 = 64;
 /// The number of cameras to try for one room.
 const CAMERAS: u32 = 24;
+/// The number of meshes of a room's shell.
+const WALLS: usize = 6;
 /// The wall in view of the cameras ([`Room::against_wall`]).
 const BACK: usize = 0;
 
@@ -250,10 +253,10 @@ fn attempt_room(
             continue;
         };
         // Every object other than the room itself must be in view.
-        if seen[6..].contains(&0) || !beams_land(&world, &laser, &objects) {
+        if seen[WALLS..].contains(&0) || !beams_land(&world, &laser, &objects) {
             continue;
         }
-        if let Some([near, far]) = full_view(&world, &camera, bounds) {
+        if let Some([near, far]) = depths_in_box((&world, WALLS), room.corners(), &camera, bounds) {
             camera.intrinsics = Intrinsics::from_fov(fov, width, height);
             let notes = BTreeMap::from([
                 ("attempt".to_owned(), attempt.to_string()),

@@ -26,8 +26,12 @@ pub(crate) struct Model {
     pub(crate) lo: Vec3,
     /// The largest coordinates.
     pub(crate) hi: Vec3,
-    tree: CwBvh,
+    /// `None` for at most [`FEW`] triangles, which are all tested.
+    tree: Option<CwBvh>,
 }
+
+/// The number of triangles up to which testing all of them takes less time than a tree.
+const FEW: usize = 12;
 
 /// The intersection of a ray with a scene.
 #[derive(Debug, Clone, Copy)]
@@ -107,20 +111,23 @@ impl Model {
         }
         let (lo, hi) = mesh.bounds()?;
         let corner = |v: u32| <[f32; 3]>::from(mesh.positions[v as usize]).into();
-        let triangles: Vec<Triangle> = mesh
-            .triangles
-            .iter()
-            .map(|&[a, b, c]| Triangle {
-                v0: corner(a),
-                v1: corner(b),
-                v2: corner(c),
-            })
-            .collect();
+        let tree = match mesh.triangles.len() {
+            0..=FEW => None,
+            _ => {
+                let triangle = |&[a, b, c]: &[u32; 3]| Triangle {
+                    v0: corner(a),
+                    v1: corner(b),
+                    v2: corner(c),
+                };
+                let triangles: Vec<Triangle> = mesh.triangles.iter().map(triangle).collect();
+                Some(built(&triangles)?)
+            }
+        };
         Some(Self {
             mesh: Arc::new(mesh),
             lo,
             hi,
-            tree: built(&triangles)?,
+            tree,
         })
     }
 
@@ -144,26 +151,32 @@ impl Model {
     ) -> Option<(f32, u32)> {
         // obvhs's 8-wide nodes lose rays with a component of −0.0; adding 0.0 makes it +0.0.
         let direction = direction + Vec3::ZERO;
+        let test = |k: usize| {
+            let [a, b, c] = self.mesh.triangles[k];
+            let at = |v: u32| self.mesh.positions[v as usize];
+            match intersect([at(a), at(b), at(c)], origin, direction) {
+                Some(t) if t > 0.0 && counts(k) => t,
+                _ => f32::INFINITY,
+            }
+        };
+        let Some(tree) = &self.tree else {
+            let (mut nearest, mut found) = (limit, None);
+            for k in 0..self.mesh.triangles.len() {
+                let t = test(k);
+                if t < nearest {
+                    (nearest, found) = (t, Some((t, k as u32)));
+                }
+            }
+            return found;
+        };
         let (o, d): ([f32; 3], [f32; 3]) = (origin.into(), direction.into());
         let mut hit = RayHit::none();
-        let found = self.tree.ray_traverse(
+        let found = tree.ray_traverse(
             Ray::new(o.into(), d.into(), 0.0, limit),
             &mut hit,
-            |_, id| {
-                let k = self.tree.primitive_indices[id] as usize;
-                let corners = self.mesh.triangles[k].map(|v| self.mesh.positions[v as usize]);
-                match intersect(corners, origin, direction) {
-                    Some(t) if t > 0.0 && counts(k) => t,
-                    _ => f32::INFINITY,
-                }
-            },
+            |_, id| test(tree.primitive_indices[id] as usize),
         );
-        found.then(|| {
-            (
-                hit.t,
-                self.tree.primitive_indices[hit.primitive_id as usize],
-            )
-        })
+        found.then(|| (hit.t, tree.primitive_indices[hit.primitive_id as usize]))
     }
 }
 
@@ -205,6 +218,14 @@ impl World {
             lo: lo - Vec3::splat(PAD),
             hi: hi + Vec3::splat(PAD),
         });
+    }
+
+    /// Returns the smallest and largest coordinates of the models from index `first` on, with a
+    /// small margin.
+    pub(crate) fn boxes(&self, first: usize) -> impl Iterator<Item = [Vec3; 2]> {
+        self.placed[first..]
+            .iter()
+            .map(|placed| [placed.lo, placed.hi])
     }
 
     /// Returns the closest hit with t > 0 over all placed models, ignoring thin glass. In a tie,

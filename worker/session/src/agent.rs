@@ -13,7 +13,7 @@ use std::{
 
 use picofarm_proto::{
     PROTOCOL,
-    ids::{Incarnation, WorkerId},
+    ids::{Incarnation, LeaseRef, WorkerId},
     messages::{Abilities, WorkerHello},
     trace,
 };
@@ -26,16 +26,16 @@ use crate::{
     allow::StorePrefixes,
     assignments::Assignments,
     backoff::{Backoff, random},
-    log::Unsent,
+    lanes::Lanes,
+    log::{TaskLine, Unsent},
     message::Outgoing,
-    runner::Runner,
     session,
     suspend::Suspends,
 };
 use connection::Link;
 use leaving::{Haste, Leaving};
 
-/// Interval for sending the log of the running task.
+/// Interval for sending the logs of the running tasks.
 const LOG_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Runs a worker with this executor until `shutdown` or a refusal.
@@ -85,8 +85,7 @@ async fn work(
         coordinator = config.coordinator, "worker starts");
     let mut agent = Agent {
         assignments: Assignments::new(),
-        runner: Runner::start(executor, config.threads, allowed)?,
-        control: None,
+        lanes: Lanes::start(executor, config.threads, allowed)?,
         unsent: Unsent::default(),
         log_at: Instant::now(),
         suspends: Suspends::new(),
@@ -119,12 +118,10 @@ async fn work(
 
 struct Agent {
     assignments: Assignments,
-    runner: Runner,
-    /// The control of the running task.
-    control: Option<Arc<Control>>,
+    lanes: Lanes,
     /// Unsent log lines of tasks.
     unsent: Unsent,
-    /// The next time to send the log of the running task.
+    /// The next time to send the logs of the running tasks.
     log_at: Instant,
     /// The configured coordinators.
     targets: Vec<Target>,
@@ -157,7 +154,7 @@ impl Agent {
             if self.leave(now) {
                 return Ok(());
             }
-            self.work(now);
+            self.work(now)?;
             self.idle(now);
             self.end_in_time(now);
             let wake = self.wake(now);
@@ -167,7 +164,9 @@ impl Agent {
                 .is_some_and(|l| l.haste == Haste::Stop);
             tokio::select! {
                 event = self.link.event() => self.link_event(event)?,
-                result = self.runner.finished() => self.task_ended(result),
+                (lease, index, lines, result) = self.lanes.finished() => {
+                    self.task_ended((lease, index), lines, result);
+                }
                 () = tokio::time::sleep_until(wake.into()) => {}
                 () = shutdown.cancelled(), if !stopping => self.begin_leaving(Haste::Stop),
             }
@@ -190,26 +189,28 @@ impl Agent {
         }
     }
 
-    /// Starts the next task if none is running, and sends pending messages.
-    fn work(&mut self, now: Instant) {
-        if let Some(task) = self.assignments.begin(now) {
+    /// Starts the next tasks that may run now, and sends pending messages.
+    fn work(&mut self, now: Instant) -> Result<(), AgentError> {
+        while let Some(task) = self
+            .assignments
+            .begin(now, |task| self.lanes.together(task))
+        {
             info!(job = %task.job, task = task.index, "task starts");
             let control = Arc::new(Control::expecting(&task.spec.stores));
-            self.control = Some(control.clone());
             let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
                 task = task.index);
-            if let Some(hand) = self.assignments.current() {
-                trace::join(&span, &hand.traceparent);
-            }
+            let hand = self.assignments.running().last();
+            let hand = hand.expect("a task that is begun is running");
+            let lease = hand.lease;
+            trace::join(&span, &hand.traceparent);
             self.assignments.traced(trace::traceparent(&span));
-            self.runner.begin(task, control, span);
+            self.lanes.begin(task, lease, control, span)?;
         }
-        if let Some(hand) = self.assignments.current()
-            && now >= self.log_at
-        {
+        if !self.assignments.running().is_empty() && now >= self.log_at {
             self.log_at = now + LOG_INTERVAL;
-            let lines = self.runner.log().take();
-            self.unsent.push(hand.lease, hand.task.index, lines);
+            for (lease, index, lines) in self.lanes.logs() {
+                self.unsent.push(lease, index, lines);
+            }
         }
         if let Link::Up { session, .. } = &self.link {
             for log in self.unsent.drain(now) {
@@ -219,6 +220,7 @@ impl Agent {
                 session.send(message);
             }
         }
+        Ok(())
     }
 
     /// Returns the time at which the loop must run again even without an event.
@@ -229,18 +231,21 @@ impl Agent {
             .chain(idle.map(|(since, most)| since + most))
             .chain(self.assignments.paused_until())
             .chain(self.assignments.ends_at())
-            .chain(self.assignments.current().map(|_| self.log_at))
+            .chain(self.assignments.running().first().map(|_| self.log_at))
             .filter(|at| *at > now)
             .min()
             .unwrap_or(now + Duration::from_secs(60))
     }
 
-    fn task_ended(&mut self, result: Result<Output, TaskError>) {
+    fn task_ended(
+        &mut self,
+        task: (LeaseRef, u64),
+        lines: Vec<TaskLine>,
+        result: Result<Output, TaskError>,
+    ) {
         let now = Instant::now();
-        self.control = None;
-        let hand = self.assignments.ended(now, &result);
+        let hand = self.assignments.ended(now, task, &result);
         // The lines are sent before the report, because log lines after it are ignored.
-        let lines = self.runner.log().end();
         self.unsent.push(hand.lease, hand.task.index, lines);
         let (job, task, seconds) = (
             hand.task.job,

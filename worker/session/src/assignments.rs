@@ -1,4 +1,4 @@
-//! The worker's leases, its running task, and its unacknowledged reports. Pure: the time is passed
+//! The worker's leases, its running tasks, and its unacknowledged reports. Pure: the time is passed
 //! in, and messages to send are returned. See the parent module for the reasoning.
 
 mod heartbeats;
@@ -29,7 +29,7 @@ use held::HeldLease;
 /// short tasks do not wait for the coordinator, and long ones are not hoarded.
 const AHEAD: Duration = Duration::from_secs(2);
 
-/// The running task.
+/// A running task.
 #[derive(Debug)]
 pub(crate) struct CurrentTask {
     /// Its lease.
@@ -46,7 +46,8 @@ pub(crate) struct CurrentTask {
 #[derive(Debug)]
 pub(crate) struct Assignments {
     leases: Vec<HeldLease>,
-    current: Option<CurrentTask>,
+    /// The running tasks. All are of one stage.
+    running: Vec<CurrentTask>,
     outbox: Outbox,
     /// Unanswered heartbeats of this connection, oldest first. Each answer belongs to the oldest.
     beats: VecDeque<Beat>,
@@ -67,7 +68,7 @@ impl Assignments {
     pub(crate) fn new() -> Self {
         Self {
             leases: Vec::new(),
-            current: None,
+            running: Vec::new(),
             outbox: Outbox::default(),
             beats: VecDeque::new(),
             asked: false,
@@ -84,9 +85,9 @@ impl Assignments {
         self.leases.iter().map(|h| h.lease).collect()
     }
 
-    /// Returns the running task.
-    pub(crate) fn current(&self) -> Option<&CurrentTask> {
-        self.current.as_ref()
+    /// Returns the running tasks.
+    pub(crate) fn running(&self) -> &[CurrentTask] {
+        &self.running
     }
 
     /// Returns the number of unacknowledged reports.
@@ -150,8 +151,7 @@ impl Assignments {
         true
     }
 
-    /// Handles a revoked lease. Returns `true` if the running task belongs to it and must stop.
-    /// This is the case only if the lease was still live, because then its work is not wanted. A
+    /// Handles a revoked lease. Returns `true` if running tasks belong to it and must stop. This is the case only if the lease was still live, because then its work is not wanted. A
     /// lease that had already expired is merely lost.
     pub(crate) fn revoked(&mut self, now: Instant, lease: LeaseRef) -> bool {
         let live = self
@@ -159,7 +159,7 @@ impl Assignments {
             .iter()
             .any(|h| h.lease == lease && now < h.end());
         self.leases.retain(|h| h.lease != lease);
-        live && self.current.as_ref().is_some_and(|t| t.lease == lease)
+        live && self.running.iter().any(|t| t.lease == lease)
     }
 
     /// Handles a lease with tasks from `hi` on moved to another worker.
@@ -178,9 +178,14 @@ impl Assignments {
         report
     }
 
-    /// Takes the next task that may be started, if none is running.
-    pub(crate) fn begin(&mut self, now: Instant) -> Option<Task> {
-        if self.current.is_some() || self.draining || self.paused(now) {
+    /// Takes the next task that may be started: if none is running, or if fewer tasks of its stage
+    /// are running than may run `together`.
+    pub(crate) fn begin(
+        &mut self,
+        now: Instant,
+        together: impl Fn(&Task) -> usize,
+    ) -> Option<Task> {
+        if self.draining || self.paused(now) {
             return None;
         }
         let held = self
@@ -193,9 +198,15 @@ impl Assignments {
             stage: held.stage,
             index: held.next,
         };
+        let other = |t: &CurrentTask| t.task.stage != task.stage || t.task.job != task.job;
+        if !self.running.is_empty()
+            && (self.running.iter().any(other) || self.running.len() >= together(&task))
+        {
+            return None;
+        }
         held.next += 1;
         held.pass_skipped();
-        self.current = Some(CurrentTask {
+        self.running.push(CurrentTask {
             lease: held.lease,
             task: task.clone(),
             traceparent: held.traceparent.clone(),
@@ -204,25 +215,27 @@ impl Assignments {
         Some(task)
     }
 
-    /// Records the running task's own span in a trace.
+    /// Records the own span of the task that was begun last in a trace.
     pub(crate) fn traced(&mut self, traceparent: String) {
-        if let Some(hand) = &mut self.current {
+        if let Some(hand) = self.running.last_mut() {
             hand.traceparent = traceparent;
         }
     }
 
-    /// Handles the end of the running task. Its report goes to the outbox: every finished task,
+    /// Handles the end of a running task. Its report goes to the outbox: every finished task,
     /// even if its lease is lost (the output is valid anyway), and failures only if the worker
     /// still has the lease.
     pub(crate) fn ended(
         &mut self,
         now: Instant,
+        (lease, index): (LeaseRef, u64),
         result: &Result<Output, TaskError>,
     ) -> CurrentTask {
+        let mut running = self.running.iter();
+        let at = running.position(|t| (t.lease, t.task.index) == (lease, index));
         let hand = self
-            .current
-            .take()
-            .expect("only the task in hand can end: the runner runs one at a time");
+            .running
+            .remove(at.expect("only a running task can end"));
         let held = self.leases.iter().any(|h| h.lease == hand.lease);
         if result.is_ok() {
             self.pace = Some((hand.task.stage, now - hand.since));
@@ -269,14 +282,15 @@ impl Assignments {
     /// lease is requested while the worker has tasks of another stage.
     fn wants(&self) -> bool {
         let waiting: u64 = self.leases.iter().map(|h| h.hi - h.next).sum();
-        let left = waiting + u64::from(self.current.is_some());
+        let left = waiting + self.running.len() as u64;
         let ahead = self.leases.iter().filter(|h| h.next < h.hi);
-        let current = self.current.iter().map(|hand| hand.task.stage);
+        let current = self.running.iter().map(|hand| hand.task.stage);
         let mut stages = ahead.map(|h| h.stage).chain(current);
         let soon_over = self.pace.is_some_and(|(stage, pace)| {
             if stages.any(|other| other != stage) {
                 return false;
             }
+            let left = left.div_ceil(self.running.len().max(1) as u64);
             let left = u32::try_from(left).unwrap_or(u32::MAX);
             pace.saturating_mul(left) <= AHEAD
         });
@@ -306,9 +320,9 @@ impl Assignments {
 
     /// Drops leases that are finished and have no unacknowledged reports.
     fn tidy(&mut self) {
-        let current = self.current.as_ref().map(|t| t.lease);
-        let outbox = &self.outbox;
+        let (running, outbox) = (&self.running, &self.outbox);
+        let runs = |lease| running.iter().any(|t| t.lease == lease);
         self.leases
-            .retain(|h| h.next < h.hi || Some(h.lease) == current || outbox.mentions(h.lease));
+            .retain(|h| h.next < h.hi || runs(h.lease) || outbox.mentions(h.lease));
     }
 }

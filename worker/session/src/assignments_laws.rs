@@ -18,13 +18,15 @@ use picofarm_settings::{PrimitiveRooms, Spots};
 use proptest::prelude::*;
 use uuid::Uuid;
 
-use crate::executor::{Output, TaskError};
+use crate::executor::{Output, Task, TaskError};
 use crate::{
     assignments::Assignments,
     message::{Outgoing, Report},
 };
 
 const TTL: Duration = Duration::from_millis(900);
+/// Number of tasks that may run at the same time.
+const LANES: usize = 2;
 
 #[derive(Debug, Clone)]
 enum Step {
@@ -118,6 +120,43 @@ fn asks(assignments: &mut Assignments, now: Instant) -> bool {
     sent.iter().any(|m| matches!(m, Outgoing::Credit(1)))
 }
 
+/// Begins and ends the next task.
+fn run_one(assignments: &mut Assignments, now: Instant) {
+    let task = assignments.begin(now, |_| 1).expect("a task is there");
+    let lease = assignments.running()[0].lease;
+    assignments.ended(now, (lease, task.index), &result(2));
+}
+
+#[test]
+fn tasks_run_together_as_far_as_they_allow_and_never_with_those_of_another_stage() {
+    let (mut assignments, start) = (Assignments::new(), Instant::now());
+    let of = |epoch, tasks, stage| Lease {
+        key: StageKey([stage; 32]),
+        ..lease(epoch, tasks, Vec::new())
+    };
+    assert!(assignments.granted(start, of(1, 3, 0)));
+    assert!(assignments.granted(start, of(2, 1, 1)));
+    let together = |task: &Task| match task.stage.0[0] {
+        0 => 2,
+        _ => 9,
+    };
+    let mut begun = || assignments.begin(start, together).map(|task| task.index);
+    assert_eq!([begun(), begun(), begun()], [Some(0), Some(1), None]);
+    let first = assignments.running()[0].lease;
+    // They end in any order.
+    assignments.ended(start, (first, 1), &result(2));
+    let third = assignments.begin(start, together).expect("one is left");
+    assert_eq!(third.index, 2);
+    assignments.ended(start, (first, 0), &result(2));
+    assert!(
+        assignments.begin(start, together).is_none(),
+        "a task of another stage waits for the last of these"
+    );
+    assignments.ended(start, (first, 2), &result(2));
+    let other = assignments.begin(start, together).expect("nothing runs");
+    assert_eq!(other.stage.0[0], 1);
+}
+
 #[test]
 fn after_a_stage_of_short_tasks_one_task_of_another_is_enough() {
     let (mut assignments, start) = (Assignments::new(), Instant::now());
@@ -127,8 +166,7 @@ fn after_a_stage_of_short_tasks_one_task_of_another_is_enough() {
     };
     assert!(asks(&mut assignments, start), "nothing to do");
     assert!(assignments.granted(start, of(1, 0)));
-    assignments.begin(start).expect("a task is there");
-    assignments.ended(start, &result(2));
+    run_one(&mut assignments, start);
     // The next task of the same stage will end soon, so another lease is requested; this one is of
     // a second stage.
     assert!(asks(&mut assignments, start), "nothing to do");
@@ -139,11 +177,11 @@ fn after_a_stage_of_short_tasks_one_task_of_another_is_enough() {
         !asks(&mut assignments, start),
         "nobody knows how long the second stage's task takes"
     );
-    assignments.begin(start).expect("a task is there");
-    assignments.ended(start, &result(2));
-    assignments.begin(start).expect("a task is there");
+    run_one(&mut assignments, start);
+    let task = assignments.begin(start, |_| 1).expect("a task is there");
     assert!(!asks(&mut assignments, start), "it is in hand");
-    assignments.ended(start, &result(2));
+    let lease = assignments.running()[0].lease;
+    assignments.ended(start, (lease, task.index), &result(2));
     assert!(asks(&mut assignments, start), "nothing to do");
 }
 
@@ -179,10 +217,10 @@ proptest! {
                     }
                 }
                 Step::Begin => {
-                    let free = assignments.current().is_none();
-                    if let Some(task) = assignments.begin(now) {
-                        prop_assert!(free, "one at a time");
-                        let lease = assignments.current().unwrap().lease;
+                    let free = assignments.running().len() < LANES;
+                    if let Some(task) = assignments.begin(now, |_| LANES) {
+                        prop_assert!(free, "too many at a time");
+                        let lease = assignments.running().last().unwrap().lease;
                         prop_assert!(started.insert((lease, task.index)), "twice");
                         prop_assert!(!skipped.contains(&(lease, task.index)), "skipped");
                         let life = renewed.get(&lease).expect("not lost");
@@ -190,8 +228,11 @@ proptest! {
                     }
                 }
                 Step::End(kind) => {
-                    if assignments.current().is_some() {
-                        let hand = assignments.ended(now, &result(kind));
+                    let running = assignments.running().iter();
+                    let mut running: Vec<_> = running.map(|t| (t.lease, t.task.index)).collect();
+                    if !running.is_empty() {
+                        let task = running.swap_remove(usize::from(kind) % running.len());
+                        let hand = assignments.ended(now, task, &result(kind));
                         if kind > 1 {
                             finished.insert((hand.lease, hand.task.index));
                         }
@@ -204,7 +245,7 @@ proptest! {
                     assignments.suspended(long);
                 }
                 Step::Heartbeat => {
-                    let Outgoing::Heartbeat { leases, progress, .. } = assignments.heartbeat(now, 0.5, TaskAt::default()) else {
+                    let Outgoing::Heartbeat { leases, progress, .. } = assignments.heartbeat(now, |_| (0.5, TaskAt::default())) else {
                         unreachable!()
                     };
                     prop_assert!(progress.iter().all(|p| leases.contains(&p.lease)));
@@ -229,7 +270,7 @@ proptest! {
                 Step::Revoke(k) => {
                     if let Some(lease) = assignments.held().get(k).copied() {
                         let life = renewed.remove(&lease).expect("held leases are not lost");
-                        let mine = assignments.current().is_some_and(|t| t.lease == lease);
+                        let mine = assignments.running().iter().any(|t| t.lease == lease);
                         prop_assert_eq!(assignments.revoked(now, lease), mine && now + slept - life < TTL);
                     }
                 }

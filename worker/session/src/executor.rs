@@ -1,5 +1,5 @@
-//! The interface between the session and the work: an [`Executor`] runs one task at a time and
-//! returns its result.
+//! The interface between the session and the work: an [`Executor`] runs a task and returns
+//! its result.
 
 use std::{
     collections::BTreeMap,
@@ -72,8 +72,9 @@ pub enum TaskError {
     Stopped,
 }
 
-/// Runs tasks. It is called on a thread of the worker's own rayon pool, one task at a time, and may
-/// block. A panic counts as [`TaskError::Crash`], and the worker continues.
+/// Runs tasks. It is called on threads of the worker's own rayon pools and may block. A task runs
+/// alone, unless [`Executor::together`] allows others like it at the same time. A panic counts as
+/// [`TaskError::Crash`], and the worker continues.
 pub trait Executor: Send + Sync + 'static {
     /// Returns the supported kinds of tasks, each with its code version.
     fn kinds(&self) -> BTreeMap<String, String>;
@@ -84,6 +85,12 @@ pub trait Executor: Send + Sync + 'static {
     /// Returns the names of the GPUs in use.
     fn gpus(&self) -> Vec<String> {
         Vec::new()
+    }
+
+    /// Returns how many tasks like this one may run at the same time on a worker with `threads`. 1
+    /// means that the task uses all of them.
+    fn together(&self, _task: &Task, _threads: usize) -> usize {
+        1
     }
 
     /// Runs `task` to its end, reports its progress to `control`, and stops on request.

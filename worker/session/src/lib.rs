@@ -11,6 +11,7 @@ mod assignments_laws;
 mod backoff;
 mod config;
 mod executor;
+mod lanes;
 mod log;
 mod machine;
 mod message;

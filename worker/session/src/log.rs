@@ -1,5 +1,5 @@
-//! Forwards tasks' log lines to the coordinator. The threads of a worker's pool work for one task
-//! at a time, so all of their lines belong to the running task. [`task_logs`] must be among the
+//! Forwards tasks' log lines to the coordinator. The threads of a lane's pool work for one task at
+//! a time, so all of their lines belong to the running task. [`task_logs`] must be among the
 //! layers of the program's subscriber; without it, tasks' lines stay on this machine.
 
 use std::{

@@ -17,7 +17,7 @@ pub(crate) enum Outgoing {
     Heartbeat {
         /// The worker's leases.
         leases: Vec<LeaseRef>,
-        /// Progress of the running task.
+        /// Progress of the running tasks.
         progress: Vec<TaskProgress>,
         /// Milliseconds until the worker must end; 0 = unknown.
         ends_in_ms: u64,

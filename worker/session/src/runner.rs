@@ -1,4 +1,4 @@
-//! The thread that runs tasks, with its own rayon pool. It is a plain thread instead of a tokio
+//! A thread that runs tasks, with its own rayon pool. It is a plain thread instead of a tokio
 //! thread, because a task that does not stop must not prevent the process from ending.
 //!
 //! A task checks for stop requests often, but not everywhere: a library may be decoding a file, or
@@ -13,6 +13,7 @@ use std::{
         Arc,
         mpsc::{Receiver, RecvTimeoutError, channel},
     },
+    task::{Context, Poll},
     time::{Duration, Instant},
 };
 
@@ -99,7 +100,7 @@ impl Runner {
         Ok(Self { jobs, results, log })
     }
 
-    /// Begins `task`, within `span`. [`Runner::finished`] returns its result.
+    /// Begins `task`, within `span`. [`Runner::poll_finished`] returns its result.
     pub(crate) fn begin(&self, task: Task, control: Arc<Control>, span: Span) {
         self.jobs
             .send((task, control, span))
@@ -111,13 +112,12 @@ impl Runner {
         &self.log
     }
 
-    /// Waits for the end of the running task. Cancel-safe; it never returns while no task is
-    /// running.
-    pub(crate) async fn finished(&mut self) -> Ended {
-        self.results
-            .recv()
-            .await
-            .expect("the executor's thread lives as long as its runner: it catches every panic")
+    /// Returns the result of the running task once it has ended; pending while no task is running.
+    pub(crate) fn poll_finished(&mut self, context: &mut Context<'_>) -> Poll<Ended> {
+        self.results.poll_recv(context).map(|ended| {
+            ended
+                .expect("the executor's thread lives as long as its runner: it catches every panic")
+        })
     }
 }
 

@@ -206,6 +206,10 @@ impl Executor for TaskExecutor {
         libraries.map(|l| l.fingerprint().to_owned()).collect()
     }
 
+    fn together(&self, task: &Task, threads: usize) -> usize {
+        self.0.stores.together(&task.spec, threads)
+    }
+
     fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let spec = &task.spec.task;
         let ((field, asked), ours) = (spec.versioned(), version(spec.kind()));

@@ -5,7 +5,7 @@ use picofarm_dataset::DatasetSpec;
 use picofarm_proto::{
     show,
     spec::{
-        TaskSpec,
+        SceneKind, StageSpec, TaskSpec,
         memory::{Known, Rendering, Shape, gib, peak_bytes},
     },
 };
@@ -51,6 +51,36 @@ pub(crate) fn check(
         gib(needed),
         gib(limit),
     )))
+}
+
+/// Side of the renderer's tiles, pixels. One thread renders a tile.
+const TILE: u32 = 32;
+
+/// Returns how many tasks of a stage may run at the same time on `threads`. Each has a thread for
+/// each of its tiles, or the cores that it asks for if they are more. One more task computes while
+/// another waits for its store. Together they take at most `limit_mib`; 0 = unknown. Only renders
+/// of generated scenes run together, because the memory of other tasks depends on what they read.
+pub(crate) fn together(stage: &StageSpec, threads: usize, limit_mib: u64) -> usize {
+    let TaskSpec::Render(render) = &stage.task else {
+        return 1;
+    };
+    let of_files = matches!(render.scenes.kind, SceneKind::Files { .. });
+    if of_files || render.parts > 1 || stage.resources.gpus > 0 {
+        return 1;
+    }
+    let size = render.render.resolution;
+    let tiles = u64::from(size.width.div_ceil(TILE)) * u64::from(size.height.div_ceil(TILE));
+    let cores = tiles.max(stage.resources.cores.into());
+    let fit = match peak_bytes(&stage.task, &Known::default(), threads as u32) {
+        Some(bytes) if limit_mib > 0 => (limit_mib << 20) / bytes.max(1),
+        Some(_) => u64::MAX,
+        None => 1,
+    };
+    let most = match threads as u64 / cores {
+        0 => 1,
+        side_by_side => side_by_side + 1,
+    };
+    usize::try_from(most.min(fit)).unwrap_or(usize::MAX).max(1)
 }
 
 /// Width and height of the image, and the number of triangles of a scene.
@@ -210,5 +240,31 @@ mod tests {
         assert_eq!(of((1 << 20) - left), Ok(Some(0)));
         assert!(of((1 << 20) - left - 1).is_err());
         assert_eq!(of(0), Ok(None), "not known");
+    }
+
+    #[test]
+    fn small_renders_share_threads_and_memory_and_large_ones_run_alone() {
+        let stage = |side: u32, cores: u32| -> StageSpec {
+            let text = format!(
+                r#"{{"name": "j", "scenes": {{"kind": "primitive", "count": 9}},
+                    "render": {{"renderer": "r", "resolution": {side}, "bins": 64}},
+                    "resources": {{"cores": {cores}}}, "output": {{"store": "s", "dataset": "d"}}}}"#
+            );
+            let job: picofarm_proto::spec::JobSpec = serde_json::from_str(&text).unwrap();
+            job.stages[0].clone()
+        };
+        let plenty = 1 << 20;
+        // One renders while another is published, also on a single thread.
+        assert_eq!(together(&stage(1, 0), 1, plenty), 2);
+        assert_eq!(together(&stage(32, 1), 16, plenty), 17);
+        assert_eq!(together(&stage(64, 1), 16, plenty), 5);
+        assert_eq!(together(&stage(256, 1), 16, plenty), 1);
+        // The cores that a task asks for count if they are more than its tiles.
+        assert_eq!(together(&stage(1, 8), 16, plenty), 3);
+        assert_eq!(together(&stage(1, 16), 16, plenty), 2);
+        let one = peak_bytes(&stage(1, 1).task, &Known::default(), 16).unwrap() >> 20;
+        assert_eq!(together(&stage(1, 1), 16, 3 * (one + 1)), 3);
+        assert_eq!(together(&stage(1, 1), 16, 1), 1);
+        assert_eq!(together(&stage(1, 1), 16, 0), 17);
     }
 }

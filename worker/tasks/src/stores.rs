@@ -7,12 +7,13 @@ use std::{
     time::{Duration, Instant},
 };
 
+use bytes::Bytes;
 use object_store::{ObjectStore, path::Path};
-use picofarm_dataset::{Dataset, DatasetSpec, EncodedScene, Manifest, Profile, Subsets};
+use picofarm_dataset::{Dataset, DatasetSpec, EncodedScene, METADATA, Manifest, Profile, Subsets};
 use picofarm_proto::{
     key::TaskKey,
     messages::log::VERDICT,
-    spec::{RenderTask, TaskSpec, memory::Known},
+    spec::{RenderTask, StageSpec, TaskSpec, memory::Known},
     trace,
 };
 use picofarm_results::Verdict;
@@ -20,8 +21,8 @@ use picofarm_scene::Scene;
 use picofarm_session::{Backoff, Control, TaskError, memory_mib, random};
 use picofarm_store::published::Manifest as _;
 use picofarm_store::{
-    PROBE_WITHIN, StorageError, check_identity, check_own_folder, expect_identity, open_store,
-    probe,
+    PROBE_WITHIN, StorageError, check_identity, check_own_folder, expect_identity, objects,
+    open_store, probe,
 };
 use picofarm_transient::Settings;
 use sha2::{Digest, Sha256};
@@ -45,7 +46,17 @@ const STOP_LOOK: Duration = Duration::from_millis(50);
 /// handed back.
 pub(crate) const STORE_PATIENCE: Duration = Duration::from_secs(120);
 
-/// Stores, accessed from the executor's own thread.
+/// A data set as it was last opened for writing.
+#[derive(Clone)]
+struct LastDataset {
+    /// The properties that the task described.
+    asked: DatasetSpec,
+    /// The bytes of the root's metadata.
+    root: Bytes,
+    dataset: Dataset,
+}
+
+/// Stores, accessed from the executor's own threads.
 pub(crate) struct Stores {
     runtime: Handle,
     /// Opened stores that passed the probe, by location. Their connections are kept from task to
@@ -54,6 +65,9 @@ pub(crate) struct Stores {
     /// Folders that passed the check of their contents: empty, or only with names of the kind that
     /// writes there.
     own_folders: Mutex<BTreeSet<String>>,
+    /// The data set that was last opened for writing, so that tasks of the same stage need not parse
+    /// its metadata again.
+    last: Mutex<Option<LastDataset>>,
     /// Opened stores that are only read, by location.
     sources: Mutex<BTreeMap<StoreName, StorePath>>,
     /// Maximum time for which a rendered scene is retried if the store does not accept it.
@@ -68,6 +82,7 @@ impl Stores {
             runtime,
             probed: Mutex::default(),
             own_folders: Mutex::default(),
+            last: Mutex::default(),
             sources: Mutex::default(),
             patience,
             memory_mib: memory_mib(),
@@ -93,6 +108,11 @@ impl Stores {
             networks: Vec::new(),
         };
         memory::check(&task, &known, self.memory_mib)
+    }
+
+    /// Returns how many tasks of a stage may run at the same time on `threads`.
+    pub(crate) fn together(&self, stage: &StageSpec, threads: usize) -> usize {
+        memory::together(stage, threads, self.memory_mib)
     }
 
     /// Rejects a render that uses more memory than tasks may use, once its scene is known. The
@@ -136,11 +156,33 @@ impl Stores {
     ) -> Result<Dataset, TaskError> {
         let (store, prefix) = self.probed(location, control)?;
         let prefix = prefix.join(dataset);
-        self.wait_for(
-            control,
-            Dataset::create_or_open(store, prefix, spec),
-            of_open,
-        )
+        let root = || {
+            self.wait(
+                control,
+                objects::get(&*store, &prefix.clone().join(METADATA)),
+            )
+        };
+        let same = |last: &&LastDataset| {
+            last.dataset.prefix() == &prefix
+                && last.asked == *spec
+                && Arc::ptr_eq(last.dataset.store(), &store)
+        };
+        let last = self.last.lock().expect("no panic while locked").clone();
+        // Whoever deletes or grows a data set changes its root.
+        if let Some(last) = last.as_ref().filter(same)
+            && root()?.as_ref() == Some(&last.root)
+        {
+            return Ok(last.dataset.clone());
+        }
+        let opened = Dataset::create_or_open(store.clone(), prefix.clone(), spec);
+        let dataset = self.wait_for(control, opened, of_open)?;
+        let last = root()?.map(|root| LastDataset {
+            asked: *spec,
+            root,
+            dataset: dataset.clone(),
+        });
+        *self.last.lock().expect("no panic while locked") = last;
+        Ok(dataset)
     }
 
     /// Opens a data set for reading. Creates nothing and needs only read access.

@@ -86,9 +86,26 @@ async fn an_output_is_not_made_again_for_another_job_that_waits_for_it() {
     let small = farm.submit(&spec(3)).await.job_id;
     let large = farm.submit(&spec(5)).await.job_id;
     let mut worker = farm.worker().await;
-    worker.work(&mut farm, &small).await;
-    let status = worker.work(&mut farm, &large).await;
-    assert_eq!((status.state, status.tasks.reused), (JobState::Done, 3));
+    let first = worker.work(&mut farm, &small).await;
+    let second = worker.work(&mut farm, &large).await;
+    assert_eq!(
+        (first.state, second.state),
+        (JobState::Done, JobState::Done)
+    );
+    // The jobs take turns, so that each makes some of the three outputs that both want.
+    assert_eq!((first.tasks.done, second.tasks.done), (3, 5));
+    assert_eq!(first.tasks.reused + second.tasks.reused, 3);
+    assert!(first.tasks.reused > 0 && second.tasks.reused > 0);
+    let mut made = Vec::new();
+    for job in [&small, &large] {
+        let events = farm.events(job, None).await;
+        let runs = events
+            .iter()
+            .filter(|e| e.kind() == wire::EventKind::Committed);
+        made.extend(runs.flat_map(|e| e.lo()..e.hi()));
+    }
+    made.sort_unstable();
+    assert_eq!(made, [0, 1, 2, 3, 4]);
 }
 
 #[tokio::test]

@@ -101,6 +101,56 @@ async fn the_higher_priority_goes_first_and_equals_share() {
 }
 
 #[tokio::test]
+async fn jobs_take_turns_on_a_worker_that_runs_one_task_at_a_time() {
+    let mut farm = Farm::start().await;
+    farm.submit(&named("long", 40)).await;
+    let mut worker = farm.worker().await;
+    let mut turns = Vec::new();
+    for turn in 0..8 {
+        if turn == 2 {
+            farm.submit(&named("short", 3)).await;
+        }
+        let lease = worker.lease().await;
+        turns.extend(jobs_of(&mut farm, std::slice::from_ref(&lease)).await);
+        assert!(worker.done(&lease, lease.lo).await.accepted);
+    }
+    // A new job queues behind those that wait, so that many new ones keep no old one from its turn.
+    let expected = [
+        "long", "long", "long", "short", "long", "short", "long", "short",
+    ];
+    assert_eq!(turns, expected);
+}
+
+#[tokio::test]
+async fn after_any_number_of_leases_the_shares_of_equal_jobs_differ_by_at_most_one() {
+    let mut farm = Farm::start().await;
+    for name in ["a", "b", "c"] {
+        farm.submit(&named(name, 40)).await;
+    }
+    let mut worker = farm.worker().await;
+    let mut shares = [0i32; 3];
+    // One lease at a time, then two and three, so that the worker asks with and without leases.
+    for at_once in [1, 1, 1, 1, 2, 3, 2, 1, 1, 1] {
+        let held = leases(&mut worker, at_once).await;
+        for name in jobs_of(&mut farm, &held).await {
+            shares[usize::from(name.as_bytes()[0] - b'a')] += 1;
+            // Of leases granted together the order is not known, so that each counts alone.
+            if at_once == 1 {
+                let (least, most) = (shares.iter().min(), shares.iter().max());
+                assert!(most.unwrap() - least.unwrap() <= 1, "{shares:?}");
+            }
+        }
+        for lease in &held {
+            for task in lease.lo..lease.hi {
+                assert!(worker.done(lease, task).await.accepted);
+            }
+        }
+    }
+    let (least, most) = (shares.iter().min(), shares.iter().max());
+    assert!(most.unwrap() - least.unwrap() <= 1, "{shares:?}");
+}
+
+#[tokio::test]
 async fn no_more_workers_than_a_job_allows() {
     let mut farm = Farm::start().await;
     let mut limited = named("limited", 40);

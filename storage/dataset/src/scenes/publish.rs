@@ -112,7 +112,7 @@ impl Dataset {
     async fn publish_once(&self, scene: EncodedScene) -> Result<Manifest, StorageError> {
         let EncodedScene { manifest, bytes } = scene;
         let (id, published) = (manifest.scene, self.published_scenes());
-        let conflict = match published.publish(&id, &manifest, &bytes).await {
+        let conflict = match published.publish_together(&id, &manifest, &bytes).await {
             Ok(()) => return Ok(manifest),
             Err(conflict @ StorageError::Conflict { .. }) => conflict,
             Err(error) => return Err(error),

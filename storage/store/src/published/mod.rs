@@ -22,6 +22,7 @@ use crate::concurrent::{check_size, create_all, create_missing, run_all};
 use crate::error::StorageError;
 use crate::objects;
 use crate::sealed::{ObjectEntry, sha256_hex};
+use crate::together::create_together;
 use crate::verify::{VerifyMode, read_intact};
 
 pub use id::ResultId;
@@ -220,6 +221,29 @@ impl<M: Manifest> Published<M> {
         let path = self.manifest_path(id);
         objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
         create_missing(&*self.store, &self.with_paths(id, manifest, bytes)).await
+    }
+
+    /// Publishes a result like [`Self::publish`], and makes the objects of a small one in a folder
+    /// durable with one flush. A power failure before the manifest exists may leave torn objects,
+    /// with which this call conflicts, so the caller must be able to tell and replace them.
+    ///
+    /// # Errors
+    /// Those of [`Self::publish`].
+    pub async fn publish_together(
+        &self,
+        id: &M::Id,
+        manifest: &M,
+        bytes: &[Bytes],
+    ) -> Result<(), StorageError> {
+        let objects = self.with_paths(id, manifest, bytes);
+        let (store, path) = (&*self.store, self.manifest_path(id));
+        let manifest: Bytes = manifest.to_bytes().into();
+        if create_together(store, &objects, (&path, manifest.clone())).await? {
+            return Ok(());
+        }
+        create_all(store, &objects).await?;
+        objects::create_last_or_match(store, &objects, &path, manifest).await?;
+        create_missing(store, &objects).await
     }
 
     /// Puts the objects of a result that is not published yet, create-only.

@@ -11,6 +11,7 @@ use tracing::{error, info, warn};
 use super::{Agent, leaving::Haste};
 use crate::{
     AgentError, Target,
+    assignments::CurrentTask,
     backoff::random,
     message::Incoming,
     session::{self, LinkError, Session, Welcome},
@@ -124,12 +125,8 @@ impl Agent {
             let text = format!("no answer to heartbeats for {:.1} s", silent.as_secs_f64());
             return self.lost(now, LinkError::Down(text));
         }
-        let (fraction, at) = self
-            .control
-            .as_ref()
-            .map(|c| c.progress())
-            .unwrap_or_default();
-        session.send(self.assignments.heartbeat(now, fraction, at));
+        let progress = |task: &CurrentTask| self.lanes.progress(task);
+        session.send(self.assignments.heartbeat(now, progress));
         *next_beat = now + welcome.heartbeat;
         Ok(())
     }
@@ -139,9 +136,7 @@ impl Agent {
         let reason = match error {
             LinkError::Mismatch(reason) if self.welcomed => reason,
             LinkError::Refused(reason) | LinkError::Mismatch(reason) => {
-                if let Some(control) = &self.control {
-                    control.stop();
-                }
+                self.lanes.stop();
                 return Err(AgentError::Refused {
                     coordinator: self.coordinator.clone(),
                     reason,
@@ -214,10 +209,8 @@ impl Agent {
             }
             Incoming::Revoke { lease, reason } => {
                 info!(range = %lease.range, epoch = %lease.epoch, reason, "lease revoked");
-                if self.assignments.revoked(now, lease)
-                    && let Some(control) = &self.control
-                {
-                    control.give_up();
+                if self.assignments.revoked(now, lease) {
+                    self.lanes.give_up(lease);
                 }
             }
             Incoming::Trim { lease, hi } => {

@@ -1,4 +1,4 @@
-//! Ends the worker: it gives back its leases, lets a task finish or save its progress, and waits
+//! Ends the worker: it gives back its leases, lets tasks finish or save their progress, and waits
 //! for acknowledgements.
 
 use std::time::{Duration, Instant};
@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use tracing::{info, warn};
 
 use super::{Agent, connection::Link};
+use crate::assignments::CurrentTask;
 
 /// A running task with at most this remaining time may finish after the shutdown signal.
 const FINISH_WITHIN: Duration = Duration::from_millis(1500);
@@ -43,7 +44,7 @@ impl Agent {
     /// Ends a worker that has been idle for too long.
     pub(super) fn idle(&mut self, now: Instant) {
         let connected = matches!(self.link, Link::Up { .. });
-        if self.assignments.current().is_some() || self.leaving.is_some() || !connected {
+        if !self.assignments.running().is_empty() || self.leaving.is_some() || !connected {
             self.idle_since = None;
             return;
         }
@@ -74,10 +75,8 @@ impl Agent {
         let nearly_done = self
             .remaining(now)
             .is_some_and(|left| left <= FINISH_WITHIN);
-        let saves = self
-            .assignments
-            .current()
-            .is_some_and(|hand| hand.task.spec.task.resumes());
+        let mut running = self.assignments.running().iter();
+        let saves = running.any(|hand| hand.task.spec.task.resumes());
         let stop_at = match haste {
             Haste::Finish if saves => now,
             Haste::Finish => now + LONGEST_TASK,
@@ -85,19 +84,15 @@ impl Agent {
             Haste::Stop => now,
         };
         info!(
-            running = self.assignments.current().is_some(),
+            running = self.assignments.running().len(),
             nearly_done,
             ?haste,
             "shutting down"
         );
         self.assignments.release_waiting(SHUTDOWN);
-        let (fraction, at) = self
-            .control
-            .as_ref()
-            .map(|c| c.progress())
-            .unwrap_or_default();
         if let Link::Up { session, .. } = &self.link {
-            for message in self.assignments.withdraw(now, fraction, at) {
+            let progress = |task: &CurrentTask| self.lanes.progress(task);
+            for message in self.assignments.withdraw(now, progress) {
                 session.send(message);
             }
         }
@@ -109,12 +104,16 @@ impl Agent {
         });
     }
 
-    /// Estimates the remaining time of the running task from its progress so far.
+    /// Estimates the remaining time of the running tasks from their progress so far. Returns `None`
+    /// if no task is running, or one has made no progress.
     fn remaining(&self, now: Instant) -> Option<Duration> {
-        let since = self.assignments.current()?.since;
-        let fraction = self.control.as_ref()?.fraction();
-        let left = (now - since).as_secs_f64() * f64::from((1.0 - fraction) / fraction);
-        Duration::try_from_secs_f64(left).ok()
+        let mut longest = None;
+        for hand in self.assignments.running() {
+            let fraction = self.lanes.control(hand)?.fraction();
+            let left = (now - hand.since).as_secs_f64() * f64::from((1.0 - fraction) / fraction);
+            longest = longest.max(Some(Duration::try_from_secs_f64(left).ok()?));
+        }
+        longest
     }
 
     /// Takes the next step of leaving. Returns `true` when the worker may end.
@@ -122,18 +121,16 @@ impl Agent {
         let Some(leaving) = &mut self.leaving else {
             return false;
         };
-        let running = self.assignments.current().is_some();
+        let running = !self.assignments.running().is_empty();
         if running && now < leaving.give_up {
-            if let Some(control) = &self.control
-                && now >= leaving.stop_at
-            {
-                control.stop();
+            if now >= leaving.stop_at {
+                self.lanes.stop();
             }
             return false;
         }
         if !leaving.released {
             if running {
-                warn!("the running task did not stop; the worker leaves without it");
+                warn!("not all running tasks stopped; the worker leaves without them");
             }
             leaving.released = true;
             leaving.give_up = now + GOODBYE_WITHIN;

@@ -7,7 +7,7 @@ use picofarm_proto::{
     messages::{TaskAt, TaskProgress},
 };
 
-use super::Assignments;
+use super::{Assignments, CurrentTask};
 use crate::message::Outgoing;
 
 /// An unanswered heartbeat.
@@ -48,7 +48,7 @@ impl Assignments {
 
     /// Handles the answer to the oldest unanswered heartbeat: the leases `named` are renewed.
     /// Returns the leases that the heartbeat listed and the answer does not. These are lost, and
-    /// only a task already running continues.
+    /// only tasks already running continue.
     pub(crate) fn renewed(
         &mut self,
         now: Instant,
@@ -80,19 +80,27 @@ impl Assignments {
 
     /// Withdraws a request for a lease. Returns the zero credit and a heartbeat; the answer to this
     /// heartbeat proves that no lease is in transit.
-    pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Vec<Outgoing> {
+    pub(crate) fn withdraw(
+        &mut self,
+        now: Instant,
+        progress: impl Fn(&CurrentTask) -> (f32, TaskAt),
+    ) -> Vec<Outgoing> {
         if !self.asked {
             return Vec::new();
         }
-        let heartbeat = self.heartbeat(now, fraction, at);
+        let heartbeat = self.heartbeat(now, progress);
         if let Some(beat) = self.beats.back_mut() {
             beat.withdrawal = true;
         }
         vec![Outgoing::Credit(0), heartbeat]
     }
 
-    /// Returns the heartbeat to send now.
-    pub(crate) fn heartbeat(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Outgoing {
+    /// Returns the heartbeat to send now, with the `progress` and activity of each running task.
+    pub(crate) fn heartbeat(
+        &mut self,
+        now: Instant,
+        progress: impl Fn(&CurrentTask) -> (f32, TaskAt),
+    ) -> Outgoing {
         let leases = self.held();
         self.beats.push_back(Beat {
             sent: now,
@@ -101,14 +109,17 @@ impl Assignments {
             withdrawal: false,
         });
         let progress = self
-            .current
+            .running
             .iter()
             .filter(|t| leases.contains(&t.lease))
-            .map(|t| TaskProgress {
-                lease: t.lease,
-                index: t.task.index,
-                fraction,
-                at: at.clone(),
+            .map(|t| {
+                let (fraction, at) = progress(t);
+                TaskProgress {
+                    lease: t.lease,
+                    index: t.task.index,
+                    fraction,
+                    at,
+                }
             })
             .collect();
         Outgoing::Heartbeat {

@@ -37,11 +37,10 @@ impl Assignments {
 
     /// Gives back every lease with remaining or running tasks.
     pub(crate) fn release_all(&mut self, reason: &str) {
-        let current = self.current.as_ref().map(|t| t.lease);
         let open: Vec<_> = self
             .leases
             .iter()
-            .filter(|h| h.next < h.hi || Some(h.lease) == current)
+            .filter(|h| h.next < h.hi || self.runs(h.lease))
             .map(|h| h.lease)
             .collect();
         for lease in open {
@@ -49,19 +48,23 @@ impl Assignments {
         }
     }
 
-    /// Gives back every lease with remaining tasks, except that of the running task; its remaining
-    /// tasks are given back when this ends.
+    /// Gives back every lease with remaining tasks, except those of running tasks; their remaining
+    /// tasks are given back when these end.
     pub(crate) fn release_waiting(&mut self, reason: &str) {
-        let current = self.current.as_ref().map(|t| t.lease);
         let open: Vec<_> = self
             .leases
             .iter()
-            .filter(|h| h.next < h.hi && Some(h.lease) != current)
+            .filter(|h| h.next < h.hi && !self.runs(h.lease))
             .map(|h| h.lease)
             .collect();
         for lease in open {
             self.release(lease, reason);
         }
+    }
+
+    /// Returns whether a task of the lease is running.
+    fn runs(&self, lease: LeaseRef) -> bool {
+        self.running.iter().any(|t| t.lease == lease)
     }
 
     pub(super) fn release(&mut self, lease: LeaseRef, reason: &str) {

@@ -59,6 +59,12 @@ struct Bench {
     go: Sender<()>,
 }
 
+impl Bench {
+    async fn finished(&mut self) -> Ended {
+        std::future::poll_fn(|context| self.runner.poll_finished(context)).await
+    }
+}
+
 fn bench() -> Bench {
     let (begun, heard) = channel();
     let (go, wait) = channel();
@@ -90,14 +96,14 @@ async fn a_task_that_does_not_notice_is_left_and_the_next_one_waits_for_its_end(
     assert_eq!(bench.begun.recv(), Ok(1));
     first.stop();
     // The first task is still blocked.
-    assert_eq!(bench.runner.finished().await, Err(TaskError::Stopped));
+    assert_eq!(bench.finished().await, Err(TaskError::Stopped));
     bench.runner.begin(task(&spec, 2), second, Span::none());
     let early = bench.begun.recv_timeout(Duration::from_millis(200));
     assert_eq!(early, Err(RecvTimeoutError::Timeout));
     bench.go.send(()).unwrap();
     assert_eq!(bench.begun.recv(), Ok(2));
     bench.go.send(()).unwrap();
-    assert_eq!(bench.runner.finished().await.map(|o| o.bytes), Ok(2));
+    assert_eq!(bench.finished().await.map(|o| o.bytes), Ok(2));
 }
 
 #[tokio::test]
@@ -110,9 +116,9 @@ async fn a_training_may_save_what_it_has_unless_nobody_wants_it() {
         .begin(task(&spec, 1), control.clone(), Span::none());
     assert_eq!(bench.begun.recv(), Ok(1));
     control.stop();
-    let waited = tokio::time::timeout(2 * NOTICE, bench.runner.finished()).await;
+    let waited = tokio::time::timeout(2 * NOTICE, bench.finished()).await;
     assert!(waited.is_err(), "it saves: {waited:?}");
     control.give_up();
-    assert_eq!(bench.runner.finished().await, Err(TaskError::Stopped));
+    assert_eq!(bench.finished().await, Err(TaskError::Stopped));
     bench.go.send(()).unwrap();
 }
