@@ -49,7 +49,7 @@ pub fn from_flash(
         // A mirror has its own depth. To leave it out costs more than its wrong shadows.
         mirror: &none,
     })?;
-    let sure = Sure {
+    let sure = Certainty {
         lit: &found.lit,
         confidence: &found.confidence,
         range: &range,
@@ -69,7 +69,7 @@ pub fn from_flash(
 
 /// How surely one flash decides depth and shadows.
 #[derive(Debug, Clone, Copy)]
-pub struct Sure<'a> {
+pub struct Certainty<'a> {
     /// Probability of light, `[beam][row][column]`.
     pub lit: &'a [f32],
     /// Confidence of the depth, `[row][column]`.
@@ -88,9 +88,9 @@ pub struct Sure<'a> {
 pub fn weigh(
     measured: &mut Measured,
     beams: &[u32],
-    sure: &Sure<'_>,
+    sure: &Certainty<'_>,
 ) -> Result<(), ReconstructError> {
-    let Sure {
+    let Certainty {
         lit,
         confidence,
         range,

@@ -5,7 +5,7 @@ use crate::common;
 use common::{room, small};
 use picofarm_reconstruct::{
     Measured, ReconstructError, Reconstructed, Unwatched, reconstruct,
-    source::{Given, Sure, Times, given, weigh},
+    source::{Certainty, Given, Times, given, weigh},
 };
 use picofarm_scene::plato::PlatoObject;
 
@@ -17,8 +17,8 @@ fn in_patch(p: usize) -> bool {
     (p % SIDE) >= 40 && (p % SIDE) < 60 && (8..28).contains(&(p / SIDE))
 }
 
-fn sure<'a>(lit: &'a [f32], confidence: &'a [f32], range: &'a [f32]) -> Sure<'a> {
-    Sure {
+fn sure<'a>(lit: &'a [f32], confidence: &'a [f32], range: &'a [f32]) -> Certainty<'a> {
+    Certainty {
         lit,
         confidence,
         range,

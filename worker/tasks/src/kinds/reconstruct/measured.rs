@@ -4,7 +4,7 @@ use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_proto::spec::kinds::reconstruct::{Measurements, Mirrors};
 use picofarm_reconstruct::{
     Measured,
-    source::{Given, Sure, Times, given, weigh},
+    source::{Certainty, Given, Times, given, weigh},
 };
 use picofarm_results::{Predictions, SceneUsed};
 use picofarm_scene::{Intrinsics, Vec3};
@@ -175,12 +175,12 @@ impl Work<'_> {
         .map_err(reconstruction_error)?;
         if let Some(sure) = &images.sure {
             let probability: Vec<f32> = of_beams(&sure.lit, &beams, pixels);
-            let sure = Sure {
+            let certainty = Certainty {
                 lit: &probability,
                 confidence: &sure.confidence,
                 range: &range,
             };
-            weigh(&mut measured, &beams, &sure).map_err(reconstruction_error)?;
+            weigh(&mut measured, &beams, &certainty).map_err(reconstruction_error)?;
         }
         Ok(measured)
     }
