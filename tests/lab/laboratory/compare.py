@@ -30,6 +30,8 @@ MESHES = {
     "3d-truth": "the truth",
     "3d-captures-clean": "16 captures without noise",
     "3d-captures-noisy": "16 captures",
+    "3d-expected-clean": "16 captures without noise, expected light",
+    "3d-expected-noisy": "16 captures, expected light",
     "3d-likelihood-noisy": "16 captures, likelihood ratio",
     "3d-captures-four": "4 captures",
     "3d-captures-one": "1 capture",

@@ -14,8 +14,10 @@ use crate::{
     matching,
     mirrors::Mirrors,
     planes::{Judge, Slants},
+    pulse::Pulse,
+    scale::{self, Scaled},
     shadows::shadows,
-    sweep::{Known, Volume, sweep},
+    sweep::{Known, Volume, quiet, sweep},
     unmix::Unmix,
 };
 
@@ -123,15 +125,34 @@ pub struct Judgement {
     pub seen: Vec<Vec<Vec<u8>>>,
 }
 
-/// The method; `watch` sees what shadows are judged by, and `evidence` receives it.
+/// The method at the scene's own size or that of a room; `watch` sees what shadows are judged by,
+/// and `evidence` receives it.
 pub fn take_apart(
+    capture: &Capture,
+    settings: &Settings,
+    known_depth: Option<&[f32]>,
+    evidence: Option<&mut Evidence>,
+    watch: &mut dyn FnMut(&Scene),
+) -> Result<Demultiplexed, DemultiplexError> {
+    capture.check()?;
+    let factor = scale::factor(capture);
+    if factor == 1.0 {
+        return in_room(capture, settings, known_depth, evidence, watch);
+    }
+    let scaled = Scaled::new(capture, factor);
+    let known = known_depth.map(|depth_m| scaled.depth(depth_m));
+    let capture = scaled.capture(capture);
+    let found = in_room(&capture, settings, known.as_deref(), evidence, watch)?;
+    Ok(scaled.back(found))
+}
+
+fn in_room(
     capture: &Capture,
     settings: &Settings,
     known_depth: Option<&[f32]>,
     mut evidence: Option<&mut Evidence>,
     watch: &mut dyn FnMut(&Scene),
 ) -> Result<Demultiplexed, DemultiplexError> {
-    capture.check()?;
     let camera = capture.camera;
     let rays = Rays::new(camera.intrinsics);
     let places = places(capture);
@@ -168,6 +189,11 @@ pub fn take_apart(
         .map(|part| part.iter().map(share).sum())
         .collect();
     let (gate, bins) = (&merged, merged.bins as usize);
+    let pulse = Pulse::of_returns(capture, &rays, &sources).map(|p| p.summed(per));
+    let histogram = match pulse.filter(|p| !p.is_narrow()) {
+        Some(pulse) => pulse.remove(&histogram, gate, quiet(gate, &sources)),
+        None => histogram,
+    };
     let sum = |h: &[f32]| h.iter().sum::<f32>();
     let intensity: Vec<f32> = histogram.chunks(bins).map(sum).collect();
     let log: Vec<f32> = intensity.iter().map(|x| libm::logf(x.max(1e-30))).collect();

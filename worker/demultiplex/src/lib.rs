@@ -20,7 +20,9 @@ mod matching;
 mod mirrors;
 mod peaks;
 mod planes;
+mod pulse;
 mod residual;
+mod scale;
 pub mod score;
 mod separate;
 mod settings;
@@ -39,4 +41,4 @@ pub use settings::{Settings, Shading};
 pub use shadows::Ground;
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "demultiplex-5";
+pub const VERSION: &str = "demultiplex-6";

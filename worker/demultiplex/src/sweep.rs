@@ -136,7 +136,7 @@ pub fn sweep(
 
 /// Number of the first bins in which no light of the laser can be: every path leads by way of a
 /// spot, and none from there to the camera is shorter than the straight line.
-fn quiet(gate: &Gate, sources: &[Source]) -> usize {
+pub fn quiet(gate: &Gate, sources: &[Source]) -> usize {
     let straight = sources.iter().map(|s| s.path_m + s.square.sqrt());
     let first_m = straight.fold(f32::INFINITY, f32::min) - PULSE_M;
     ((f64::from(first_m) - gate.start_m) / gate.bin_width_m).max(0.0) as usize

@@ -9,7 +9,7 @@ mod rendered;
 mod truth;
 
 pub use captures::{Captures, LIT_THRESHOLD};
-pub use flash::{from_flash, weigh};
+pub use flash::{Certainty, from_flash, weigh};
 pub use given::{Given, Times, given};
 pub use rendered::{CaptureProgress, CaptureSettings, captures_of, truth_of};
 pub use truth::{Disturbed, from_truth, surface_normals};

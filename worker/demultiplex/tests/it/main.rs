@@ -4,3 +4,4 @@ mod bad_input;
 mod common;
 mod laws;
 mod separate;
+mod size_and_pulse;

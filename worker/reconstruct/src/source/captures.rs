@@ -1,9 +1,10 @@
 //! Measurements from K separate single-spot histograms, as in PlatoNeRF (its `src/run_platonerf.py`
 //! and `utils/load_tof.py`; numbers in the code are the steps of its preprocessing).
 //!
-//! Two steps differ: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin
-//! late), and pixels near a spot are not used (PlatoNeRF sets their histograms to zero, which then
-//! count as shadow). [`Captures::finish`] continues from there and compares each pixel's two-bounce
+//! Three steps differ: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin
+//! late), pixels near a spot are not used (PlatoNeRF sets their histograms to zero, which then
+//! count as shadow), and a pulse wider than three bins counts as one return (PlatoNeRF's bins are
+//! as wide as its pulse). [`Captures::finish`] continues from there and compares each pixel's two-bounce
 //! light with the expected light of a lit pixel; [`Captures::finish_plain`] does not.
 
 use picofarm_scene::{Beam, Camera, Laser, Vec3};
@@ -25,6 +26,11 @@ pub const LIT_THRESHOLD: f32 = 0.15;
 const ASTRAY: f32 = 0.04;
 /// Bins of the pulse template below this share of its peak are omitted.
 const TEMPLATE_FLOOR: f32 = 1e-3;
+/// The greatest width of a pulse at half of its peak, bins, for which a return is its brightest bin
+/// and both neighbours.
+const NARROW: usize = 3;
+/// The share of a wider pulse's width to which a time is known.
+const RESOLVED: f32 = 0.25;
 /// The share of a pixel's light whose arrival counts as first light.
 const EARLY: f32 = 0.03;
 /// With photon noise, the number of standard deviations from which a peak counts as a return.
@@ -217,20 +223,16 @@ impl Captures {
         counted: Option<&Counted>,
     ) {
         let bins = self.gate.bins as usize;
-        let taps: Vec<(usize, f32)> = template
-            .iter()
-            .copied()
-            .enumerate()
-            .filter(|&(_, v)| v >= TEMPLATE_FLOOR)
-            .collect();
-        let (first, last) = (
-            taps.first().map_or(0, |t| t.0),
-            taps.last().map_or(0, |t| t.0),
-        );
+        let pulse = Pulse::new(template);
+        if pulse.is_wide() {
+            let resolved = RESOLVED * pulse.width as f32 * self.gate.bin_width_m as f32;
+            self.measured.bin_width_m = self.measured.bin_width_m.max(resolved);
+        }
         let to_spot = (spot.point - self.measured.camera.origin).normalized();
         // No light of this spot arrives before that of its shortest path.
         let soonest = spot.path_m + (spot.point - self.measured.camera.origin).length();
-        let dark = (f64::from(soonest) - self.gate.start_m) / self.gate.bin_width_m - 2.0;
+        let dark = (f64::from(soonest) - self.gate.start_m) / self.gate.bin_width_m
+            - (2 * pulse.half()) as f64;
         let dark = (dark.max(0.0) as usize).min(bins);
         let this = &*self;
         let pixel = |(p, h): (usize, &[f32])| -> (f32, u8, u8, Return) {
@@ -246,25 +248,17 @@ impl Captures {
                 };
                 return (0.0, 0, 0, none);
             }
-            let (bin, _) = peak(h);
-            let mut response = 0.0f32;
-            for lag in -(last as i64)..(bins - first) as i64 {
-                let at = |t: usize| usize::try_from(t as i64 + lag).ok().and_then(|b| h.get(b));
-                let c: f32 = taps
-                    .iter()
-                    .map(|&(t, v)| v * at(t).copied().unwrap_or(0.0))
-                    .sum();
-                response = response.max(c);
-            }
+            let (bin, response) = pulse.response(h);
             let tau = this.middle(bin);
-            let around = &h[bin.saturating_sub(1)..(bin + 2).min(bins)];
+            let half = pulse.half();
+            let around = &h[bin.saturating_sub(half)..(bin + half + 1).min(bins)];
             let near: f32 = around.iter().sum();
             // The variance of counts is their sum, ambient counts included.
             let noise = counted.map_or(0.0, |c| {
                 (near.max(0.0) + c.ambient[p] * around.len() as f32).sqrt()
             });
             let certain = near >= CERTAIN * noise;
-            let lit = response / sum >= this.threshold && tau > spot.path_m && certain;
+            let lit = response / sum >= this.threshold * pulse.own && tau > spot.path_m && certain;
             let strongest = Return {
                 path_m: tau,
                 energy: near,
@@ -282,6 +276,88 @@ impl Captures {
             self.returns.push(strongest);
         }
         self.measured.spots.push(spot);
+    }
+}
+
+/// The pulse of a capture.
+struct Pulse<'a> {
+    /// The share of each bin of the template above the floor, with its bin.
+    taps: Vec<(usize, f32)>,
+    /// The template from the first of these bins to the last.
+    whole: &'a [f32],
+    first: usize,
+    /// The bin of its peak.
+    peak: usize,
+    /// Its width at half of the peak, bins.
+    width: usize,
+    /// The greatest response of a histogram that is the pulse alone; 1 for a narrow one, because
+    /// the threshold refers to it.
+    own: f32,
+}
+
+impl<'a> Pulse<'a> {
+    fn new(template: &'a [f32]) -> Self {
+        let above = |&(_, v): &(usize, f32)| v >= TEMPLATE_FLOOR;
+        let taps: Vec<(usize, f32)> =
+            (template.iter().copied().enumerate().filter(above)).collect();
+        let first = taps.first().map_or(0, |t| t.0);
+        let last = taps.last().map_or(0, |t| t.0);
+        let (peak, most) = peak(template);
+        let high = |v: &&f32| **v >= 0.5 * most;
+        let width = template[..peak].iter().rev().take_while(high).count()
+            + template[peak..].iter().take_while(high).count();
+        let own = match width > NARROW {
+            true => taps.iter().map(|(_, v)| v * v).sum(),
+            false => 1.0,
+        };
+        Self {
+            taps,
+            whole: template.get(first..=last).unwrap_or(&[]),
+            first,
+            peak,
+            width,
+            own,
+        }
+    }
+
+    fn is_wide(&self) -> bool {
+        self.width > NARROW
+    }
+
+    /// Returns the number of bins on each side of a return's brightest one that are part of it.
+    fn half(&self) -> usize {
+        match self.is_wide() {
+            true => self.width / 2,
+            false => 1,
+        }
+    }
+
+    /// Returns the bin of the strongest return and the greatest response of the matched filter. A
+    /// narrow return is the highest bin. A wide one is where the response is greatest.
+    fn response(&self, h: &[f32]) -> (usize, f32) {
+        let bins = h.len();
+        if !self.is_wide() {
+            let last = self.taps.last().map_or(0, |t| t.0);
+            let mut response = 0.0f32;
+            for lag in -(last as i64)..(bins - self.first) as i64 {
+                let at = |t: usize| usize::try_from(t as i64 + lag).ok().and_then(|b| h.get(b));
+                let taps = self.taps.iter();
+                let c: f32 = taps.map(|&(t, v)| v * at(t).copied().unwrap_or(0.0)).sum();
+                response = response.max(c);
+            }
+            return (peak(h).0, response);
+        }
+        let before = self.peak - self.first;
+        let mut best = (0, 0.0f32);
+        for bin in 0..bins {
+            let whole = &self.whole[before.saturating_sub(bin)..];
+            let light = &h[bin.saturating_sub(before)..];
+            let c: f32 = whole.iter().zip(light).map(|(v, h)| v * h).sum();
+            if c > best.1 {
+                best = (bin, c);
+            }
+        }
+        best
     }
 }
 

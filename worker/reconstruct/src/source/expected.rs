@@ -34,7 +34,7 @@ const ROUNDS: usize = 2;
 pub(super) struct Return {
     /// The path, metres.
     pub path_m: f32,
-    /// The light in its bin and the two adjacent ones.
+    /// The light in its bin and in the adjacent ones that are part of it.
     pub energy: f32,
     /// The share of all light.
     pub share: f32,

@@ -49,7 +49,12 @@ pub fn from_flash(
         // A mirror has its own depth. To leave it out costs more than its wrong shadows.
         mirror: &none,
     })?;
-    weigh(&mut measured, &numbers, &found.lit, &found.confidence)?;
+    let sure = Certainty {
+        lit: &found.lit,
+        confidence: &found.confidence,
+        range: &range,
+    };
+    weigh(&mut measured, &numbers, &sure)?;
     for spot in &mut measured.spots {
         spot.beam = beams[spot.beam];
     }
@@ -62,22 +67,39 @@ pub fn from_flash(
     Ok(measured)
 }
 
+/// How surely one flash decides depth and shadows.
+#[derive(Debug, Clone, Copy)]
+pub struct Certainty<'a> {
+    /// Probability of light, `[beam][row][column]`.
+    pub lit: &'a [f32],
+    /// Confidence of the depth, `[row][column]`.
+    pub confidence: &'a [f32],
+    /// Distance along each pixel's ray, metres, `[row][column]`.
+    pub range: &'a [f32],
+}
+
 /// Weighs measurements by what the histogram decides: pairs of pixel and spot whose probability of
-/// light, `[beam][row][column]`, is near one half are left unused, and the confidence of the depth,
-/// `[row][column]`, is kept. `beams` are those that the measurements are of, in the order of `lit`.
+/// light is near one half are left unused, and the confidence of the depth is kept. A pixel without
+/// a lit pair has its distance all the same where the confidence allows. `beams` are those that the
+/// measurements are of, in the order of `sure.lit`.
 ///
 /// # Errors
 /// [`ReconstructError::Invalid`] naming the argument of a wrong size.
 pub fn weigh(
     measured: &mut Measured,
     beams: &[u32],
-    lit: &[f32],
-    confidence: &[f32],
+    sure: &Certainty<'_>,
 ) -> Result<(), ReconstructError> {
+    let Certainty {
+        lit,
+        confidence,
+        range,
+    } = *sure;
     let pixels = measured.pixels();
     for (field, found, expected) in [
         ("lit", lit.len(), beams.len() * pixels),
         ("confidence", confidence.len(), pixels),
+        ("range", range.len(), pixels),
     ] {
         if found != expected {
             let what = format!("has {found} values, expected {expected}");
@@ -99,6 +121,12 @@ pub fn weigh(
     // The sum of all spots does not show the first light of each.
     let unknown = vec![f32::NAN; measured.lit.len()];
     unlit::fill(measured, &unknown);
+    for (p, range) in range.iter().enumerate() {
+        let mirror = measured.mirror.get(p).is_some_and(|m| *m != 0);
+        if !measured.unlit_range_m[p].is_finite() && measured.is_evident(p) && !mirror {
+            measured.unlit_range_m[p] = *range;
+        }
+    }
     Ok(())
 }
 

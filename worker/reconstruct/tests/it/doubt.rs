@@ -5,7 +5,7 @@ use crate::common;
 use common::{room, small};
 use picofarm_reconstruct::{
     Measured, ReconstructError, Reconstructed, Unwatched, reconstruct,
-    source::{Given, Times, given, weigh},
+    source::{Certainty, Given, Times, given, weigh},
 };
 use picofarm_scene::plato::PlatoObject;
 
@@ -15,6 +15,14 @@ const SPOTS: usize = 8;
 /// Returns whether a pixel is in a patch of a tenth of the image that shows a mirror's room.
 fn in_patch(p: usize) -> bool {
     (p % SIDE) >= 40 && (p % SIDE) < 60 && (8..28).contains(&(p / SIDE))
+}
+
+fn sure<'a>(lit: &'a [f32], confidence: &'a [f32], range: &'a [f32]) -> Certainty<'a> {
+    Certainty {
+        lit,
+        confidence,
+        range,
+    }
 }
 
 /// Returns PlatoNeRF's room, whose patch seems twice as far away as it is, with the confidence
@@ -52,7 +60,7 @@ fn mirrored(confidence: Option<f32>) -> (Measured, Vec<f32>) {
             .iter()
             .map(|v| f32::from(*v))
             .collect();
-        weigh(&mut measured, &beams, &lit, &all).unwrap();
+        weigh(&mut measured, &beams, &sure(&lit, &all, &range)).unwrap();
     }
     (measured, truth)
 }
@@ -98,7 +106,8 @@ fn undecided_pairs_are_left_unused_and_sizes_that_do_not_fit_are_named() {
     let before = measured.used.clone();
     let mut lit = vec![0.9; SPOTS * pixels];
     lit[pixels..2 * pixels].fill(0.5);
-    weigh(&mut measured, &beams, &lit, &vec![1.0; pixels]).unwrap();
+    let ones = vec![1.0; pixels];
+    weigh(&mut measured, &beams, &sure(&lit, &ones, &ones)).unwrap();
     for (k, used) in measured.used.chunks(pixels).enumerate() {
         let expected = match k {
             1 => vec![0; pixels],
@@ -106,15 +115,64 @@ fn undecided_pairs_are_left_unused_and_sizes_that_do_not_fit_are_named() {
         };
         assert_eq!(used, expected, "spot {k}");
     }
-    for (beams, lit, confidence, field) in [
-        (&beams[..], &lit[1..], &lit[..pixels], "lit"),
-        (&beams[..], &lit[..], &lit[..1], "confidence"),
-        (&beams[1..], &lit[pixels..], &lit[..pixels], "beams"),
+    for (beams, lit, confidence, range, field) in [
+        (&beams[..], &lit[1..], &lit[..pixels], &ones[..], "lit"),
+        (&beams[..], &lit[..], &lit[..1], &ones[..], "confidence"),
+        (&beams[..], &lit[..], &lit[..pixels], &ones[1..], "range"),
+        (
+            &beams[1..],
+            &lit[pixels..],
+            &lit[..pixels],
+            &ones[..],
+            "beams",
+        ),
     ] {
-        let refused = weigh(&mut measured, beams, lit, confidence).unwrap_err();
+        let refused = weigh(&mut measured, beams, &sure(lit, confidence, range)).unwrap_err();
         assert!(
             matches!(&refused, ReconstructError::Invalid { field: f, .. } if f == field),
             "{refused}"
         );
     }
+}
+
+#[test]
+fn a_pixel_that_no_spot_lights_has_the_distance_of_the_flash_where_that_is_sure() {
+    let (scene, rendered) = room(PlatoObject::Chair, SPOTS, SIDE as u32);
+    let range = rendered.truth.range.clone();
+    let pixels = SIDE * SIDE;
+    let dark = in_patch;
+    let mut lit: Vec<f32> = (rendered.truth.visibility.iter())
+        .map(|v| f32::from(*v))
+        .collect();
+    for (q, lit) in lit.iter_mut().enumerate() {
+        if dark(q % pixels) {
+            *lit = 0.0;
+        }
+    }
+    let spots: Vec<_> = (rendered.spots.iter())
+        .map(|s| s.as_ref().map(|s| (s.point, s.path_m)))
+        .collect();
+    let beams: Vec<u32> = (0..SPOTS as u32).collect();
+    let known = |confidence: f32| {
+        let shifted: Vec<f32> = range.iter().map(|r| 0.8 * r).collect();
+        let mut measured = given(&Given {
+            camera: scene.camera,
+            laser: scene.laser.origin,
+            spots: &spots,
+            beams: &beams,
+            times: Times::Range(&range),
+            lit: &lit.iter().map(|p| *p as u8).collect::<Vec<_>>(),
+            mirror: &vec![0; pixels],
+        })
+        .unwrap();
+        let all = vec![confidence; pixels];
+        weigh(&mut measured, &beams, &sure(&lit, &all, &shifted)).unwrap();
+        (0..pixels)
+            .filter(|p| dark(*p) && (measured.unlit_range_m[*p] - shifted[*p]).abs() < 1e-6)
+            .count()
+    };
+    let there = (0..pixels).filter(|p| dark(*p)).count();
+    let [sure, unsure] = [1.0, 0.0].map(known);
+    assert!(sure * 10 > there * 9, "{sure} of {there} pixels");
+    assert_eq!(unsure, 0);
 }

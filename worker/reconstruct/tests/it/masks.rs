@@ -5,7 +5,7 @@ use crate::common;
 use common::{Unstopped, measured, room};
 use picofarm_reconstruct::{
     Measured,
-    source::{CaptureSettings, Captures, LIT_THRESHOLD},
+    source::{CaptureSettings, Captures, Given, LIT_THRESHOLD, Times, given},
 };
 use picofarm_scene::{Scene, plato::PlatoObject};
 use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
@@ -124,4 +124,77 @@ fn a_detector_that_sums_bins_or_cannot_be_is_refused_by_field() {
         ..Sensor::default()
     };
     assert!(refused(negative).contains("sensor.dark_per_bin"));
+}
+
+#[test]
+fn bins_much_narrower_than_the_pulse_show_the_same_pixels_lit() {
+    let (scene, rendered) = room(PlatoObject::Chair, 4, 24);
+    let spots: Vec<_> = (rendered.spots.iter())
+        .map(|s| s.as_ref().map(|s| (s.point, s.path_m)))
+        .collect();
+    let truth = given(&Given {
+        camera: scene.camera,
+        laser: scene.laser.origin,
+        spots: &spots,
+        beams: &[0, 1, 2, 3],
+        times: Times::Range(&rendered.truth.range),
+        lit: &rendered.truth.visibility,
+        mirror: &[0; 24 * 24],
+    })
+    .unwrap();
+    let [coarse, fine] = [(0.0384, 391), (0.0048, 3128)].map(|(bin_width_m, bins)| {
+        let gate = Gate {
+            start_m: 0.0,
+            bin_width_m,
+            bins,
+        };
+        let settings = CaptureSettings {
+            gate,
+            samples: 16,
+            seed: 3,
+            sensor: None,
+        };
+        // 128 ps are 3.84 cm of path: one wide bin, eight narrow ones.
+        let sensor = Sensor {
+            pulse: Pulse::Analytic { fwhm_ps: 128.0 },
+            jitter: Jitter::Gaussian { fwhm_ps: 0.0 },
+            scale: Scale::Peak { photons: 400.0 },
+            poisson: false,
+            ..Sensor::default()
+        };
+        let captures = Captures::new(scene.camera, scene.laser.clone(), gate, LIT_THRESHOLD);
+        let mut captures = captures.behind(&sensor, 7).unwrap();
+        let mut alone = scene.clone();
+        for (beam, only) in scene.laser.beams.iter().enumerate() {
+            alone.laser.beams = vec![*only];
+            let capture = render(&alone, &settings.render_settings(), &Unstopped).unwrap();
+            captures.add(beam, &capture.transient).unwrap();
+        }
+        captures.finish()
+    });
+    fine.check().unwrap();
+    let lit = |m: &Measured| {
+        (0..m.lit.len())
+            .filter(|q| m.lit[*q] * m.used[*q] != 0)
+            .count()
+    };
+    let [few, many] = [lit(&coarse), lit(&fine)];
+    assert!(
+        many * 10 > few * 8,
+        "{many} pairs are lit in narrow bins, {few} in wide ones"
+    );
+    let off = |m: &Measured| {
+        let both = |q: &usize| m.lit[*q] * m.used[*q] * truth.lit[*q] * truth.used[*q] != 0;
+        let mut all: Vec<f32> = (0..m.lit.len())
+            .filter(both)
+            .map(|q| (m.tau[q] - truth.tau[q]).abs())
+            .collect();
+        all.sort_by(f32::total_cmp);
+        all[all.len() / 2]
+    };
+    let [wide, narrow] = [off(&coarse), off(&fine)];
+    assert!(
+        narrow < wide,
+        "times are off by {narrow} m in narrow bins, {wide} m in wide ones"
+    );
 }

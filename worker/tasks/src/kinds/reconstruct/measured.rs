@@ -4,7 +4,7 @@ use picofarm_dataset::{Dataset, Manifest, Quantity};
 use picofarm_proto::spec::kinds::reconstruct::{Measurements, Mirrors};
 use picofarm_reconstruct::{
     Measured,
-    source::{Given, Times, given, weigh},
+    source::{Certainty, Given, Times, given, weigh},
 };
 use picofarm_results::{Predictions, SceneUsed};
 use picofarm_scene::{Intrinsics, Vec3};
@@ -149,7 +149,8 @@ impl Work<'_> {
         }
         let pixels = spec.pixels();
         let lit: Vec<u8> = of_beams(&images.lit, &beams, pixels);
-        let (range, paths): (Vec<f32>, Vec<f32>);
+        let mut range: Vec<f32> = Vec::new();
+        let paths: Vec<f32>;
         let times = if from == Measurements::Given {
             let all = dataset.read::<f32>(scene, Quantity::TwoBouncePath);
             paths = of_beams(&stores.wait(control, all)?, &beams, pixels);
@@ -174,8 +175,12 @@ impl Work<'_> {
         .map_err(reconstruction_error)?;
         if let Some(sure) = &images.sure {
             let probability: Vec<f32> = of_beams(&sure.lit, &beams, pixels);
-            weigh(&mut measured, &beams, &probability, &sure.confidence)
-                .map_err(reconstruction_error)?;
+            let certainty = Certainty {
+                lit: &probability,
+                confidence: &sure.confidence,
+                range: &range,
+            };
+            weigh(&mut measured, &beams, &certainty).map_err(reconstruction_error)?;
         }
         Ok(measured)
     }
