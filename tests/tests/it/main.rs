@@ -4,6 +4,7 @@
 mod arrays;
 mod attack;
 mod bad_input;
+mod calibrated;
 mod chaos;
 mod chaos_disks;
 mod clouds;

@@ -45,4 +45,4 @@ pub use world::{Hit, World};
 
 /// The version of the reconstruction, which is part of every task key. Change it whenever any bit
 /// of a result may change.
-pub const VERSION: &str = "reconstruct-7";
+pub const VERSION: &str = "reconstruct-8";

@@ -154,6 +154,24 @@ fn a_gate_that_is_off_by_a_bin_is_doubtful_and_stated() {
     assert!(found.reasons[0].contains("too late"), "{found:?}");
 }
 
+#[test]
+fn late_times_of_one_part_of_the_image_are_no_shifted_clock() {
+    let (scene, rendered) = room(PlatoObject::Chair, 16, 48);
+    let mut measured = from_truth(&scene, &rendered, &BINS).unwrap();
+    let pixels = measured.pixels();
+    // Light of three bounces by way of the wall on the right arrives 15 cm later.
+    for q in 0..measured.lit.len() {
+        if q % pixels % 48 >= 20 && measured.lit[q] != 0 {
+            measured.tau[q] += 0.15 * ((q / pixels) % 2) as f32;
+        }
+    }
+    let said = match begun(measured) {
+        Ok(found) => found.reasons.join("; "),
+        Err(refused) => refused,
+    };
+    assert!(!said.contains("where the gate begins"), "{said}");
+}
+
 /// In an open room most pixels are lit by every spot, so with inverted masks they are dark. In
 /// rooms with many shadows, the error cannot be detected.
 #[test]
