@@ -10,7 +10,7 @@ mod common;
 
 use std::{env, fmt::Display, str::FromStr, time::Instant};
 
-use common::{Capturing, Room};
+use common::Room;
 use picofarm_calibrate::{Measurement, Verdict, check};
 use picofarm_transient::Gate;
 

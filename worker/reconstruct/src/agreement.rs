@@ -51,8 +51,8 @@ pub struct Agreement {
     pub time_residual_m: Option<f32>,
     /// The spot with the largest such median, and that median.
     pub worst_spot: Option<(usize, f32)>,
-    /// The offset that the times of every part of the image have in common beyond geometry, metres
-    /// of path: the smallest of the parts' offsets, 0 if they have different signs.
+    /// The mean offset of times beyond geometry, metres of path; 0 if it is not that of every part
+    /// of the image, as a shifted clock's is.
     pub time_offset_m: Option<f32>,
     /// The median distance of spots from the visible surfaces around them, metres.
     pub spots_off_surface_m: Option<f32>,

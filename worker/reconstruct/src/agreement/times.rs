@@ -11,6 +11,8 @@ const LEAST_LIT: f32 = 0.15;
 const FAR_M: f32 = 0.3;
 /// The rows and columns of the parts of the image whose offsets are compared.
 const PARTS: usize = 2;
+/// The least share of the mean offset that the median of every part must have.
+const SHARED: f32 = 0.5;
 /// The least weight of a pixel's own offset: the sum of squares of what a change of depth cannot
 /// explain. Less than this tells no offset.
 const LEAST_WEIGHT: f64 = 0.05;
@@ -22,8 +24,8 @@ pub(crate) struct Times {
     pub pairs: usize,
     /// The median of the absolute residuals, metres.
     pub residual_m: f32,
-    /// The offset that the times of every part of the image have in common beyond geometry, metres:
-    /// positive if they are late, 0 if parts disagree. A shifted clock moves all times; light of
+    /// The mean offset of times beyond geometry, metres: positive if they are late, 0 if it is not
+    /// that of every part of the image. A shifted clock moves all times; light of
     /// three bounces and wrong walls move those of some parts.
     pub offset_m: f32,
     /// Each spot's median of its absolute residuals, metres; NaN if it has none.
@@ -108,30 +110,29 @@ fn part(measured: &Measured, pixel: usize) -> usize {
     v * PARTS / height * PARTS + u * PARTS / width
 }
 
-/// Returns the smallest of the offsets of the whole image and of its parts, from the offset of each
-/// pixel and its weight; 0 if one has another sign, NaN without any pixel. Parts with few pixels do
-/// not count.
+/// Returns the mean offset, from the offset of each pixel and its weight in the whole image and in
+/// its parts; 0 if the median of one part has another sign or much less, NaN without any pixel.
+/// Parts with few pixels do not count.
 fn shared_offset(parts: [Vec<(f32, f32)>; 1 + PARTS * PARTS]) -> f32 {
-    let all = parts[0].len();
-    let mut least = f32::NAN;
-    for mut own in parts {
-        if own.is_empty() || own.len() * 10 < all {
-            continue;
+    let [whole, parts @ ..] = parts;
+    let weight = |own: &[(f32, f32)]| own.iter().map(|o| f64::from(o.1)).sum::<f64>();
+    let sum: f64 = whole.iter().map(|o| f64::from(o.0) * f64::from(o.1)).sum();
+    let mean = (sum / weight(&whole)) as f32;
+    let shared = |mut own: Vec<(f32, f32)>| {
+        if own.is_empty() || own.len() * 10 < whole.len() {
+            return true;
         }
         own.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let half = 0.5 * own.iter().map(|o| f64::from(o.1)).sum::<f64>();
+        let half = 0.5 * weight(&own);
         let mut sum = 0.0;
         let middle = own.iter().find(|o| {
             sum += f64::from(o.1);
             sum >= half
         });
-        let offset = middle.map_or(0.0, |o| o.0);
-        least = match () {
-            () if least.is_nan() => offset,
-            () if least * offset <= 0.0 => 0.0,
-            () if offset.abs() < least.abs() => offset,
-            () => least,
-        };
+        middle.is_some_and(|o| o.0 * mean > 0.0 && o.0.abs() >= SHARED * mean.abs())
+    };
+    match mean.is_nan() || parts.into_iter().all(shared) {
+        true => mean,
+        false => 0.0,
     }
-    least
 }

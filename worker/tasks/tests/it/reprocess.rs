@@ -56,7 +56,8 @@ impl Place {
                 spots: vec![],
                 sensor,
                 drop_left_over: false,
-                on_counts: false,
+                // Some of these sources have whole numbers.
+                on_counts: true,
                 seed: 0,
                 version: sensor_version(),
             },
@@ -242,6 +243,7 @@ fn lively(pixel: usize, bin: usize) -> f32 {
 async fn photon_counts_get_another_sensors_noise_only_when_asked() {
     let counts = |p: usize, b: usize| ((p + b) % 5) as f32 / 400.0;
     let mut place = Place::new(Sensor::default());
+    place.settings.on_counts = false;
     place.publish(0, counts).await;
     let TaskError::User(said) = place.run(0).await.unwrap_err() else {
         panic!("the user's mistake");
@@ -263,9 +265,11 @@ async fn photon_counts_get_another_sensors_noise_only_when_asked() {
         rebin: 2,
         ..ideal()
     });
+    place.settings.on_counts = false;
     place.publish(0, counts).await;
     place.run(0).await.unwrap();
     place.settings.sensor.dark_per_bin = 0.1;
+    place.target.dataset = "another".into();
     let TaskError::User(said) = place.run(0).await.unwrap_err() else {
         panic!("the user's mistake");
     };
