@@ -101,7 +101,7 @@ pub(crate) fn report(f: &Findings) -> Report {
     }
     causes.extend(equal(f.m));
     causes.extend(f.failed.map(|failed| failed.cause.clone()));
-    // Without enough evidence, distance says nothing.
+    // Without enough evidence, distance is no proof.
     if let Some(share) = f.unclear.filter(|s| *s > DENIED && f.failed.is_none()) {
         causes.push(
             Found {

@@ -131,8 +131,8 @@ impl TaskKind for CalibrateTask {
 
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let source = known.source.as_ref()?;
-        // The histograms of each spot as read, without pile-up, summed to wider bins, corrected, and
-        // coded; and their sum.
+        // The histograms of each spot: as read, without pile-up, summed to wider bins, corrected,
+        // and coded; and their sum.
         let spots = 4.5 * f64::from(source.spots);
         Some(BASE + source.truth() + (4.0 + spots) * source.histogram())
     }

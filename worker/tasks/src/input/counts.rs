@@ -6,7 +6,7 @@ use serde_json::Value;
 /// Greatest distance from a whole number, as a share of it and in photons, that rounding explains.
 const ROUNDED: (f32, f32) = (1e-5, 1e-3);
 
-/// Returns whether the histogram of a scene is one of photon counts: its plan says that a sensor
+/// Returns whether the histogram of a scene is one of photon counts: by its plan a sensor
 /// drew it, or all its values are whole numbers of photons and some are not 0. `scale` converts
 /// values to photons.
 pub fn are_counts(histogram: &[f32], scale: f32, plan: &Value) -> bool {

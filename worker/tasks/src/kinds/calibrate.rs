@@ -1,5 +1,5 @@
-//! Calibration: checks a measured scene, and publishes it with a corrected calibration in a data set
-//! of its own, with the report in its manifest. The task adopts a scene that exists.
+//! Calibration: checks a measured scene, and publishes it with a corrected calibration in a data
+//! set of its own, with the report in its manifest. The task adopts a scene that exists.
 
 use picofarm_calibrate::{Checked, Measurement, VERSION, check};
 use picofarm_dataset::{
