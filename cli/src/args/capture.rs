@@ -10,7 +10,7 @@ pub enum Capture {
     #[command(after_help = DESCRIPTION)]
     Import(CaptureImport),
     /// Judge a capture and its calibration: causes with figures, and a verdict; fails if results
-    /// would be wrong
+    /// would be wrong, or if the capture cannot tell
     Check {
         /// A folder of `picofarm capture import` or of `picofarm scene render`
         capture: PathBuf,

@@ -113,6 +113,9 @@ pub struct DatasetReprocess {
     /// Drop the bins that remain after --rebin; otherwise it must divide the number of bins
     #[arg(long)]
     pub drop_left_over: bool,
+    /// Add the sensor's pulse, scale and noise to photon counts as well, which have their own
+    #[arg(long)]
+    pub on_counts: bool,
     /// Profile: counts-u16, sqrt-u16, coarse, plain-f32 or lossless [default: counts-u16, with
     /// --no-poisson sqrt-u16]
     #[arg(long, value_name = "NAME")]

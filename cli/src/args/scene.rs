@@ -111,6 +111,9 @@ pub struct SceneSense {
     pub out: PathBuf,
     #[command(flatten)]
     pub sensor: SensorArgs,
+    /// Add the sensor's pulse, scale and noise to photon counts as well, which have their own
+    #[arg(long)]
+    pub on_counts: bool,
     /// Seed of the random numbers
     #[arg(long, default_value_t = 0, value_parser = ranges::whole)]
     pub seed: u64,

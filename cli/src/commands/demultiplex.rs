@@ -58,6 +58,7 @@ struct Made {
     masks: Option<MaskScore>,
     mirrors: Option<f64>,
     residual: Option<Residual>,
+    note: Option<String>,
     spots: usize,
     placed: usize,
     seconds: f64,
@@ -110,7 +111,7 @@ fn make(args: Demultiplex) -> Result<Made> {
         "confidence": "0 to 1: how well the histogram speaks for the depth",
         "settings": settings,
         "version": version,
-        "scores": {"depth": depth, "masks": masks, "mirrors_iou": mirrors, "residual": residual},
+        "scores": {"depth": depth, "masks": masks, "mirrors_iou": mirrors, "residual": residual, "note": flash.note()},
     });
     let attributes = attributes
         .as_object()
@@ -128,6 +129,7 @@ fn make(args: Demultiplex) -> Result<Made> {
         masks,
         mirrors,
         residual,
+        note: flash.note(),
         seconds,
     })
 }
@@ -257,6 +259,9 @@ fn summary(made: &Made) -> String {
     }
     if let Some(iou) = made.mirrors {
         text += &format!("  mirrors: IoU {iou:.3}\n");
+    }
+    if let Some(note) = &made.note {
+        text += &format!("  note: {note}\n");
     }
     text
 }

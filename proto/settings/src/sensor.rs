@@ -69,6 +69,25 @@ impl Sensor {
         self.gate.map_or(source, |gate| gate.bins) / self.rebin.max(1)
     }
 
+    /// Returns the first field that makes the result other than a selection and sums of the input's
+    /// bins: `None` only for a sensor that may read photon counts without spoiling them.
+    pub fn disturbs(&self) -> Option<&'static str> {
+        let no_jitter = matches!(self.jitter, Jitter::Gaussian { fwhm_ps } if fwhm_ps == 0.0);
+        let as_it_is =
+            matches!(self.scale, Scale::Fixed { photons_per_unit } if photons_per_unit == 1.0);
+        match () {
+            () if self.pulse != (Pulse::None {}) => Some("pulse"),
+            () if !no_jitter => Some("jitter"),
+            () if !as_it_is => Some("scale"),
+            () if self.dark_per_bin > 0.0 => Some("dark_per_bin"),
+            () if self.crosstalk.is_some() => Some("crosstalk"),
+            () if self.dead_time.is_some() => Some("dead_time"),
+            () if self.afterpulsing.is_some() => Some("afterpulsing"),
+            () if self.poisson => Some("poisson"),
+            () => None,
+        }
+    }
+
     /// Returns the first field that needs an image with a time axis, such as `zones`: such a sensor
     /// cannot read single histograms.
     pub fn needs_image(&self) -> Option<&'static str> {

@@ -1,5 +1,6 @@
 //! Tests of the job model and the wire, in one executable because each one links the whole crate.
 
+mod calibrate;
 mod demultiplex;
 mod generated;
 mod graphs;

@@ -143,6 +143,31 @@ impl Verdict {
         }
     }
 
+    /// Assesses a calibration from its report.
+    pub fn of_calibration(report: &Value) -> Self {
+        let word = report["verdict"]
+            .as_str()
+            .unwrap_or("unknown")
+            .replace('_', " ");
+        let all = || report["causes"].as_array().into_iter().flatten();
+        let said = |corrected: bool| -> Vec<&str> {
+            all()
+                .filter(|c| c["corrected"] == corrected)
+                .filter_map(|c| c["finding"].as_str())
+                .collect()
+        };
+        let mut text = format!("as measured: {word}");
+        for (title, found) in [("corrected", said(true)), ("not corrected", said(false))] {
+            if !found.is_empty() {
+                text += &format!("; {title}: {}", found.join("; "));
+            }
+        }
+        match said(false).is_empty() {
+            true => Self::good(text),
+            false => Self::doubtful(text),
+        }
+    }
+
     /// Assesses the predictions of a scene from the agreement in their manifest. Returns `None` if
     /// nothing could be compared.
     pub fn of_agreement(agreement: &Value) -> Option<Self> {
@@ -224,6 +249,20 @@ mod tests {
             "light where depth and spots predict it is 2.0 times that around, two-bounce paths agree to 0.0100 m"
         );
         assert!(Verdict::of_import(&Value::Null).doubtful);
+    }
+
+    #[test]
+    fn a_calibration_is_doubtful_with_a_fault_that_is_not_corrected() {
+        let fault = |corrected: bool| json!({"finding": "t0 is off", "corrected": corrected});
+        let report = |all: Vec<Value>| json!({"verdict": "cannot_tell", "causes": all});
+        let repaired = Verdict::of_calibration(&report(vec![fault(true)]));
+        assert_eq!(
+            repaired.text,
+            "as measured: cannot tell; corrected: t0 is off"
+        );
+        assert!(!repaired.doubtful);
+        let left = Verdict::of_calibration(&report(vec![fault(false)]));
+        assert!(left.doubtful && left.text.contains("not corrected: t0 is off"));
     }
 
     #[test]

@@ -5,6 +5,7 @@ mod arrays;
 mod attack;
 mod autoalloc;
 mod bad_input;
+mod calibrated;
 mod chaos;
 mod chaos_disks;
 mod clouds;

@@ -83,6 +83,14 @@ fn job(store: &Path, side: u32, samples: u32) -> String {
                 out("rooms-3d")
             ),
         ),
+        stage("single", &format!("{}\n{}", render.replace("count = 4", "count = 1"), out("capture"))),
+        stage(
+            "calibrate",
+            &format!(
+                "kind = \"calibrate\"\nsource = \"single\"\ncalibrate = {{ accept_unexplained = true }}\n{}",
+                out("calibrated")
+            ),
+        ),
         stage("report", "kind = \"report\"\nreport = { name = \"all\", models = [\"tof\"] }"),
     ]
     .concat()

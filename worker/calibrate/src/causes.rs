@@ -5,7 +5,8 @@ use picofarm_settings::PS_PER_M;
 use crate::{
     Measurement,
     check::{Refined, Relocated, SIGNIFICANT, UNCLEAR, upright},
-    counting::{background, counting, judged, noisy},
+    counting::{background, counting, judged},
+    evidence::DENIED,
     fit::{Fitted, Observed},
     geometry::geometry,
     hypotheses::{Chosen, SCALES, order_name},
@@ -14,7 +15,7 @@ use crate::{
     numeric::{length, quantile, sub},
     observe::Seen,
     pixels::Pixels,
-    report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict},
+    report::{Agreement, Cause, Evidence, Fault, PulseFound, Report, SpotResidual, Verdict},
     unexplained::Failed,
 };
 
@@ -43,6 +44,10 @@ pub(crate) struct Findings<'a> {
     /// Of a capture of all spots at once: distance of peaks from predicted times, over that from
     /// shifted times.
     pub unclear: Option<f64>,
+    /// What the capture can show.
+    pub evidence: Evidence,
+    /// Of a capture of all spots at once: a wrong calibration with which the peaks agree as well.
+    pub as_good: Option<&'static str>,
     /// Why no calibration explains the times.
     pub failed: Option<&'a Failed>,
     /// Bins of the capture in a bin here.
@@ -84,10 +89,20 @@ pub(crate) fn report(f: &Findings) -> Report {
     let mut causes = geometry(&f.m.capture);
     discrete(f, &mut causes);
     continuous(f, &mut causes);
-    counting(f, &mut causes);
+    // Without any count, all pixels look dead.
+    if f.m.capture.histogram.iter().any(|x| *x > 0.0) {
+        let from = causes.len();
+        counting(f, &mut causes);
+        if f.failed
+            .is_some_and(|failed| failed.cause.fault == Fault::Evidence)
+        {
+            without_light(&mut causes, from, f.m.pulses.is_some());
+        }
+    }
+    causes.extend(equal(f.m));
     causes.extend(f.failed.map(|failed| failed.cause.clone()));
-    // Noise hides peaks as well.
-    if let Some(share) = f.unclear.filter(|s| *s > UNCLEAR && !noisy(&causes)) {
+    // Without enough evidence, distance is no proof.
+    if let Some(share) = f.unclear.filter(|s| *s > DENIED && f.failed.is_none()) {
         causes.push(
             Found {
                 fault: Fault::Unexplained,
@@ -95,7 +110,7 @@ pub(crate) fn report(f: &Findings) -> Report {
                 value: share,
                 error: 0.0,
                 unit: "of the distance by chance",
-                finding: format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; a right calibration has 0.15 and less"),
+                finding: format!("peaks are {share:.2} of the distance from the predicted times that they are from wrong ones; right calibrations have had {DENIED} and less"),
                 advice: "check the stated spots, the camera and the unit of time together: more than one of them is wrong, or the room moved",
                 corrected: false,
             }
@@ -117,6 +132,7 @@ pub(crate) fn report(f: &Findings) -> Report {
         causes,
         guesses: f.failed.map_or(Vec::new(), |failed| failed.guesses.clone()),
         notes: notes(f),
+        evidence: f.evidence,
         stated: Some(agreement(f.before)),
         corrected: Some(agreement(fitted)),
         unclear: f.unclear,
@@ -128,6 +144,41 @@ pub(crate) fn report(f: &Findings) -> Report {
         background: judged(f).then(|| background(f)),
         spots: (0..fitted.model.beams.len()).map(|k| spot(f, k)).collect(),
     }
+}
+
+/// Takes back what the counts of noise alone suggest: totals that are all alike are no pile-up, and
+/// a background without light makes nothing wrong that could be right.
+fn without_light(causes: &mut Vec<Cause>, from: usize, stated: bool) {
+    let mut kept = causes.split_off(from);
+    kept.retain(|c| c.fault != Fault::PileUp || stated);
+    for cause in kept.iter_mut().filter(|c| c.fault == Fault::Background) {
+        cause.severity = Verdict::Usable;
+    }
+    causes.append(&mut kept);
+}
+
+/// Names spots that have the same histograms: one file stands for two.
+fn equal(m: &Measurement) -> Option<Cause> {
+    let spots: Vec<&[f32]> = m.per_spot?.chunks(m.pixels() * m.bins()).collect();
+    let lit = |h: &[f32]| h.iter().any(|x| *x > 0.0);
+    for (k, h) in spots.iter().enumerate() {
+        if let Some(j) = (0..k).find(|j| spots[*j] == *h).filter(|_| lit(h)) {
+            let found = Found {
+                fault: Fault::EqualHistograms,
+                wrong: true,
+                value: k as f64,
+                error: 0.0,
+                unit: "spot",
+                finding: format!(
+                    "spots {j} and {k} have the same histograms, count for count: one file stands for two spots"
+                ),
+                advice: "import the file of each spot, in the order of the spots",
+                corrected: false,
+            };
+            return Some(found.cause());
+        }
+    }
+    None
 }
 
 fn spot(f: &Findings, k: usize) -> SpotResidual {

@@ -4,6 +4,7 @@ use crate::{
     CalibrateError, Measurement, Pulse, Report,
     causes::{Findings, report},
     correct::Corrected,
+    evidence,
     fit::{Fitted, Free, Observed},
     hypotheses::{Chosen, Hypothesis, Turn, choose},
     masks,
@@ -127,6 +128,7 @@ fn judge(m: &Measurement, added: usize, pixels: Pixels) -> Result<Checked, Calib
             stated_share: 1.0,
             pixels: f64::NAN,
             stated_pixels: f64::NAN,
+            rival: None,
         },
     };
     let h = &chosen.hypothesis;
@@ -136,7 +138,7 @@ fn judge(m: &Measurement, added: usize, pixels: Pixels) -> Result<Checked, Calib
         Some(_) => Least::SHARP,
         None => Least::VAGUE,
     };
-    let (mut refined, mut relocated, mut unclear) = (None, Vec::new(), None);
+    let (mut refined, mut relocated, mut unclear, mut as_good) = (None, Vec::new(), None, None);
     if m.per_spot.is_some() {
         let first = refine(&base, &observed, least, true);
         let (elsewhere, moved) = relocate(&first, &base, &observed);
@@ -149,6 +151,9 @@ fn judge(m: &Measurement, added: usize, pixels: Pixels) -> Result<Checked, Calib
         let first = refine(&base, &observed, least, false);
         let share = crate::flash::unclear(m, &first.fitted.model)?;
         unclear = Some(share);
+        if share < UNCLEAR {
+            as_good = crate::flash::as_good(m, &first.fitted.model, share)?;
+        }
         // What explains nothing corrects nothing.
         refined = Some(first).filter(|_| share < UNCLEAR);
     } else {
@@ -187,6 +192,8 @@ fn judge(m: &Measurement, added: usize, pixels: Pixels) -> Result<Checked, Calib
         relocated: &relocated,
         masks: masks.as_ref(),
         unclear,
+        evidence: evidence::measure(m, &seen.observed, &pixels.good()),
+        as_good,
         failed: None,
         added,
     };
@@ -199,6 +206,7 @@ fn judge(m: &Measurement, added: usize, pixels: Pixels) -> Result<Checked, Calib
         pixels: chosen.stated_pixels,
         stated_share: chosen.stated_share,
         stated_pixels: chosen.stated_pixels,
+        rival: None,
     };
     if failed.is_some() {
         findings = Findings {

@@ -62,6 +62,41 @@ pub(crate) fn unclear(m: &Measurement, model: &Model) -> Result<f64, CalibrateEr
     Ok(taken_apart(m, model)?.1)
 }
 
+/// Shifts of t0 and of the laser that a check must be able to see, bins and metres. Light of bins
+/// narrower than the pulse does not tell a bin.
+const SHIFT: ([f64; 2], f64) = ([1.0, 0.0384], 0.1);
+/// Factor of the distance by which a shifted calibration must be worse.
+const WORSE: f64 = 1.1;
+
+/// Returns a wrong calibration with which the peaks agree as well as with this one, whose distance
+/// is `share`.
+///
+/// # Errors
+/// Returns the errors of the method that takes the flash apart.
+pub(crate) fn as_good(
+    m: &Measurement,
+    model: &Model,
+    share: f64,
+) -> Result<Option<&'static str>, CalibrateError> {
+    let ([bins, metres], laser) = SHIFT;
+    let late = (bins * model.width).max(metres);
+    let wrong = [
+        ("a gate that begins a bin later", late, 0.0),
+        ("a gate that begins a bin earlier", -late, 0.0),
+        ("a laser 10 cm further right", 0.0, laser),
+        ("a laser 10 cm further left", 0.0, -laser),
+    ];
+    for (name, late, right) in wrong {
+        let mut shifted = model.clone();
+        shifted.start += late;
+        shifted.laser[0] += right;
+        if unclear(m, &shifted)? < WORSE * share {
+            return Ok(Some(name));
+        }
+    }
+    Ok(None)
+}
+
 /// Takes the flash apart by rules, without learnt shadows.
 fn taken_apart(m: &Measurement, model: &Model) -> Result<(Demultiplexed, f64), CalibrateError> {
     let all = vec![true; model.beams.len()];

@@ -114,7 +114,7 @@ impl Hypothesis {
         self.order.iter().enumerate().any(|(k, j)| k != *j)
     }
 
-    fn faults(&self) -> usize {
+    pub fn faults(&self) -> usize {
         usize::from(self.turn != Turn::default())
             + usize::from(self.scale > 0)
             + usize::from(self.reordered())
@@ -143,6 +143,33 @@ impl Hypothesis {
     }
 }
 
+/// The wrong calibration that comes nearest to the stated one.
+pub(crate) struct Rival {
+    pub hypothesis: Hypothesis,
+    /// Share of times that it explains after a fit.
+    pub share: f64,
+    /// Mean distance of returns from their spots, pixels; NaN without returns.
+    pub pixels: f64,
+}
+
+impl Rival {
+    /// Returns its description.
+    pub fn name(&self) -> String {
+        let h = &self.hypothesis;
+        let mut parts = Vec::new();
+        if h.turn != Turn::default() {
+            parts.push(format!("an image that is {}", h.turn.name()));
+        }
+        if h.scale > 0 {
+            parts.push(format!("times {} times as long", SCALES[h.scale].0));
+        }
+        if h.reordered() {
+            parts.push(format!("spots {}", order_name(&h.order)));
+        }
+        parts.join(" with ")
+    }
+}
+
 /// What explains the times best.
 pub(crate) struct Chosen {
     pub hypothesis: Hypothesis,
@@ -152,6 +179,8 @@ pub(crate) struct Chosen {
     /// Mean distance of returns from their spots, pixels, so and as stated; NaN without returns.
     pub pixels: f64,
     pub stated_pixels: f64,
+    /// The wrong calibration that comes nearest, if the stated one is taken.
+    pub rival: Option<Rival>,
 }
 
 /// Tries all hypotheses. Time scales are tried only where spots have stated places, because
@@ -170,6 +199,7 @@ pub(crate) fn choose(stated: &Model, seen: &Observed, width: usize, height: usiz
     let first = Hypothesis::stated(spots);
     let (base, base_distance) = score(&first);
     let mut best = (base.agreeing, base_distance, first);
+    let mut rival: Option<Rival> = None;
     let scales = if placed { SCALES.len() } else { 1 };
     for turn in Turn::all(width == height) {
         for scale in 0..scales {
@@ -198,6 +228,13 @@ pub(crate) fn choose(stated: &Model, seen: &Observed, width: usize, height: usiz
             }
             for h in tries {
                 let (fitted, distance) = score(&h);
+                if rival.as_ref().is_none_or(|r| fitted.agreeing > r.share) {
+                    rival = Some(Rival {
+                        hypothesis: h.clone(),
+                        share: fitted.agreeing,
+                        pixels: distance,
+                    });
+                }
                 let cost = |h: &Hypothesis| SIMPLER * h.faults() as f64;
                 if fitted.agreeing - cost(&h) > best.0 - cost(&best.2) {
                     best = (fitted.agreeing, distance, h);
@@ -213,6 +250,7 @@ pub(crate) fn choose(stated: &Model, seen: &Observed, width: usize, height: usiz
         best = (base.agreeing, base_distance, Hypothesis::stated(spots));
     }
     Chosen {
+        rival: rival.filter(|_| best.2.faults() == 0),
         share: best.0,
         pixels: best.1,
         stated_share: base.agreeing,

@@ -15,7 +15,9 @@
 //! 4. `fit`: t0, laser, bin width and focal length by robust least squares, with the depth of each
 //!    pixel eliminated; `spots`: single spots that are elsewhere;
 //! 5. `masks`: the order of stated masks;
-//! 6. `causes`: what was found, with figures and a verdict; `correct`: the corrected capture.
+//! 6. `evidence`, `unexplained`: whether the times can show a fault at all, and whether any
+//!    calibration explains them;
+//! 7. `causes`: what was found, with figures and a verdict; `correct`: the corrected capture.
 //!
 //! t0 refers to the peak of the pulse. This crate knows nothing of jobs or files.
 
@@ -24,6 +26,7 @@ mod causes;
 mod check;
 mod correct;
 mod counting;
+mod evidence;
 mod fit;
 mod flash;
 mod geometry;
@@ -49,7 +52,7 @@ pub use geometry::geometry;
 pub use hypotheses::Turn;
 pub use measurement::{CalibrateError, Measurement};
 pub use pulse::Pulse;
-pub use report::{Agreement, Cause, Fault, PulseFound, Report, SpotResidual, Verdict};
+pub use report::{Agreement, Cause, Evidence, Fault, PulseFound, Report, SpotResidual, Verdict};
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "calibrate-2";
+pub const VERSION: &str = "calibrate-3";

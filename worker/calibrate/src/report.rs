@@ -12,6 +12,8 @@ pub enum Verdict {
     Good,
     /// Results lose accuracy.
     Usable,
+    /// The capture does not show whether its calibration is right.
+    CannotTell,
     /// Results are wrong.
     Wrong,
 }
@@ -22,6 +24,7 @@ impl Verdict {
         match self {
             Self::Good => "good",
             Self::Usable => "usable",
+            Self::CannotTell => "cannot tell",
             Self::Wrong => "wrong",
         }
     }
@@ -63,6 +66,10 @@ pub enum Fault {
     NoReturns,
     /// Times agree with no calibration that was tried.
     Unexplained,
+    /// Too little light from too few places to judge the calibration.
+    Evidence,
+    /// Two spots have the same histograms.
+    EqualHistograms,
     /// The stated view or principal point is unusual.
     Camera,
     /// Stated spots cannot be seen, or their light cannot be in the gate.
@@ -88,6 +95,20 @@ pub struct Cause {
     pub advice: String,
     /// Whether the corrected calibration repairs it.
     pub corrected: bool,
+}
+
+/// What a capture can show, whatever its calibration.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Evidence {
+    /// Pixels with two-bounce times of two spots and more.
+    pub pixels: usize,
+    /// Times beyond the first of each pixel: those that can contradict a calibration.
+    pub times: usize,
+    /// Median standard error of a time, bins; `None` without times.
+    pub error_bins: Option<f64>,
+    /// Median difference of times of neighbouring pixels, over that of pixels far apart: 1 for
+    /// noise. `None` with few times.
+    pub neighbours: Option<f64>,
 }
 
 /// Agreement of times with a calibration.
@@ -134,6 +155,8 @@ pub struct Report {
     pub guesses: Vec<Cause>,
     /// What cannot be seen in this capture.
     pub notes: Vec<String>,
+    /// What the capture can show.
+    pub evidence: Evidence,
     /// Agreement with the stated calibration.
     pub stated: Option<Agreement>,
     /// Agreement with the corrected calibration.
@@ -153,11 +176,11 @@ pub struct Report {
 }
 
 impl Report {
-    /// Returns whether no correction can be trusted: the stated geometry is impossible, or no
-    /// calibration that was tried explains the times.
+    /// Returns whether no correction can be trusted: the stated geometry is impossible, no
+    /// calibration that was tried explains the times, or the capture cannot show which does.
     pub fn unexplained(&self) -> bool {
         self.causes.iter().any(|c| match c.fault {
-            Fault::Unexplained => true,
+            Fault::Unexplained | Fault::Evidence | Fault::EqualHistograms => true,
             Fault::Spots | Fault::Camera => c.severity == Verdict::Wrong,
             _ => false,
         })

@@ -3,6 +3,7 @@
 
 use crate::{
     causes::{Findings, Found, continuous, discrete},
+    evidence::lacking,
     hypotheses::apart,
     numeric::quantile,
     report::{Cause, Fault, Verdict},
@@ -43,9 +44,14 @@ pub(crate) struct Failed {
     pub guesses: Vec<Cause>,
 }
 
+/// Returns why nothing may be corrected: the capture shows too little, or nothing explains it.
+pub(crate) fn failed(f: &Findings) -> Option<Failed> {
+    lacking(f).or_else(|| unexplained(f))
+}
+
 /// Returns why the refined calibration of a capture with a histogram for each spot explains
 /// nothing; `None` if it explains the times.
-pub(crate) fn failed(f: &Findings) -> Option<Failed> {
+pub(crate) fn unexplained(f: &Findings) -> Option<Failed> {
     f.m.per_spot?;
     let share = f.refined.fitted.agreeing;
     let percent = 100.0 * share;

@@ -22,7 +22,7 @@ use crate::{
 use returns::{Return, Timing};
 
 /// Version of the methods: changes whenever any bit of a result may change.
-pub const SEPARATE_VERSION: &str = "separate-1";
+pub const SEPARATE_VERSION: &str = "separate-2";
 
 /// A published method for separate captures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -2,11 +2,15 @@
 //! with the surrounding surfaces, and shadows and light with the space that the camera sees
 //! through. No true scene is required.
 
+mod times;
+
 use picofarm_scene::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::{Depth, Measured, closed_form::smooth, paths::Paths};
+
+pub(crate) use times::{Times, times};
 
 /// The approximate greatest number of pixels with evaluated paths.
 const PIXELS: usize = 2048;
@@ -14,29 +18,12 @@ const PIXELS: usize = 2048;
 const FEWEST_SPOTS: usize = 3;
 /// The least number of times for judging a single spot.
 const FEWEST_TIMES: usize = 50;
-/// The least share of lit pixels for judging a single spot.
-const LEAST_LIT: f32 = 0.15;
-/// Residuals beyond this are excluded from the common offset, metres.
-const FAR_M: f32 = 0.3;
 /// The step along a path, metres.
 const STEP_M: f32 = 0.03;
 /// The least distance of a position in front of a surface, or behind it, metres.
 const CLEAR_M: f32 = 0.06;
 /// Neighbours with a smaller relative difference in depth are one surface.
 const SMOOTH: f32 = 0.04;
-
-/// The agreement of times with one depth a pixel, before spots are refined.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Times {
-    /// The number of pairs of a pixel and a spot.
-    pub pairs: usize,
-    /// The median of the absolute residuals, metres.
-    pub residual_m: f32,
-    /// The offset that all times have in common beyond geometry, metres: positive if they are late.
-    pub offset_m: f32,
-    /// Each spot's median of its absolute residuals, metres; NaN if it has none.
-    pub by_spot_m: Vec<f32>,
-}
 
 /// The verdict on the figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -64,7 +51,8 @@ pub struct Agreement {
     pub time_residual_m: Option<f32>,
     /// The spot with the largest such median, and that median.
     pub worst_spot: Option<(usize, f32)>,
-    /// The offset that all times have in common beyond geometry, metres of path.
+    /// The mean offset of times beyond geometry, metres of path; 0 if it is not that of every part
+    /// of the image, as a shifted clock's is.
     pub time_offset_m: Option<f32>,
     /// The median distance of spots from the visible surfaces around them, metres.
     pub spots_off_surface_m: Option<f32>,
@@ -74,74 +62,6 @@ pub struct Agreement {
     pub shadows_without_cause: Option<f32>,
     /// The share of lit paths that pass through a surface that the camera sees.
     pub light_through_surfaces: Option<f32>,
-}
-
-/// Returns the residuals of times if depths along the rays are `range`.
-pub(crate) fn times(measured: &Measured, range: &[f32]) -> Times {
-    let pixels = measured.pixels();
-    let foci: Vec<Vec3> = measured
-        .spots
-        .iter()
-        .map(|s| s.point - measured.camera.origin)
-        .collect();
-    let mut by_spot: Vec<Vec<f32>> = vec![Vec::new(); foci.len()];
-    let (mut across, mut square) = (0.0f64, 0.0f64);
-    let mut found: Vec<(usize, f32, f32)> = Vec::with_capacity(foci.len());
-    let mut used = vec![0usize; foci.len()];
-    for p in sample(pixels) {
-        let (r, x) = (measured.ray(p), range[p]);
-        found.clear();
-        if !x.is_finite() {
-            continue;
-        }
-        for (i, &l) in foci.iter().enumerate() {
-            let q = i * pixels + p;
-            used[i] += usize::from(measured.used[q] != 0);
-            if measured.lit[q] == 0 || measured.used[q] == 0 {
-                continue;
-            }
-            let way = r * x - l;
-            let length = way.length();
-            let slope = 1.0 + way.dot(r) / length.max(1e-3);
-            let late = measured.tau[q] - measured.spots[i].path_m - x - length;
-            found.push((i, slope, late));
-        }
-        if found.len() < FEWEST_SPOTS {
-            continue;
-        }
-        for &(i, _, late) in &found {
-            by_spot[i].push(late.abs());
-        }
-        // The component orthogonal to a change of depth shows an offset that all times share.
-        let near = || found.iter().filter(|f| f.2.abs() < FAR_M);
-        let (sum, squares) = near().fold((0.0f64, 0.0f64), |(a, b), f| {
-            (a + f64::from(f.1), b + f64::from(f.1) * f64::from(f.1))
-        });
-        for &(_, slope, late) in near() {
-            let beside = 1.0 - f64::from(slope) * sum / squares.max(1e-9);
-            across += beside * f64::from(late);
-            square += beside;
-        }
-    }
-    let mut all: Vec<f32> = by_spot.iter().flatten().copied().collect();
-    Times {
-        pairs: all.len(),
-        residual_m: median(&mut all),
-        offset_m: if square > 0.0 {
-            (across / square) as f32
-        } else {
-            f32::NAN
-        },
-        by_spot_m: by_spot
-            .iter_mut()
-            .zip(used)
-            .map(|(all, used)| {
-                // If a spot lights almost nothing, most of its times may be false returns.
-                let enough = all.len() >= FEWEST_TIMES.max((LEAST_LIT * used as f32) as usize);
-                if enough { median(all) } else { f32::NAN }
-            })
-            .collect(),
-    }
 }
 
 impl Agreement {

@@ -7,7 +7,8 @@ use picofarm_proto::spec::{
     EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
     kinds::{
-        Declared, DemultiplexTask, ReconstructTask, VerifyTask, export::FORMATS, reconstruct::MLP,
+        CalibrateTask, Declared, DemultiplexTask, ReconstructTask, VerifyTask, export::FORMATS,
+        reconstruct::MLP,
     },
 };
 use picofarm_session::{AgentError, Executor};
@@ -65,6 +66,7 @@ kinds! {
     Part(PartTask),
     EvaluateShard(EvaluateShardTask),
     Demultiplex(DemultiplexTask),
+    Calibrate(CalibrateTask),
 }
 
 /// Optional parts of kinds, and whether this program was built with them. See

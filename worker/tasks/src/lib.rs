@@ -28,6 +28,7 @@ mod task;
 
 pub use executor::{TaskExecutor, resolve};
 pub use input::camera::slant;
+pub use input::counts;
 #[cfg(feature = "networks")]
 pub use input::models::{model_version, takes};
 pub use kinds::{demultiplex, export, reconstruct, reprocess, split};

@@ -4,7 +4,8 @@
 use std::path::Path;
 
 use picofarm_calibrate::{
-    Cause, Checked, Measurement, Report, VERSION, Verdict, check as judge, geometry as stated,
+    Cause, Checked, Fault, Measurement, Report, VERSION, Verdict, check as judge,
+    geometry as stated,
 };
 use picofarm_demultiplex as flash;
 use picofarm_exchange::capture::{Beam, Capture};
@@ -25,6 +26,21 @@ const NARROW: f64 = 0.5;
 /// What to check where no correction explains the times.
 const BY_HAND: &str = "check by hand the camera (fov_deg in degrees, cx, cy), the order of rows and columns (axes), the unit and axes of spots_m and laser_m (metres; frame), and t0; then import the capture again";
 
+/// What to do where the capture shows too little.
+const MISSING: &str = "measure what is missing as said above, or use the capture as it is: `reconstruct` and `demultiplex` print whether their own results agree";
+/// What to do where one file stands for two spots.
+const AGAIN: &str = "correct what is named above, and import the capture again";
+
+/// Returns what to do about a capture that nothing corrects.
+fn why(report: &Report) -> &'static str {
+    let has = |fault| report.causes.iter().any(|c| c.fault == fault);
+    match () {
+        () if has(Fault::EqualHistograms) => AGAIN,
+        () if has(Fault::Evidence) => MISSING,
+        () => BY_HAND,
+    }
+}
+
 /// The report and its picture in a capture's folder: `dataset verify` expects them there.
 const REPORT: &str = "render/calibration.json";
 const PICTURE: &str = "render/calibration.png";
@@ -42,17 +58,24 @@ pub fn check(folder: &Path, output: Output) -> Result<()> {
     });
     match checked.report.verdict {
         Verdict::Good | Verdict::Usable => Ok(()),
+        Verdict::CannotTell => {
+            let what = format!(
+                "{}: the capture does not show whether its calibration is right",
+                folder.display()
+            );
+            Err(CliError::new(Code::Failed, what).hint(MISSING))
+        }
         Verdict::Wrong => {
             let what = format!("{}: the capture would give wrong results", folder.display());
             let wrong = checked.report.causes.iter();
             let mut wrong = wrong.filter(|c| c.severity == Verdict::Wrong);
             let hint = match () {
-                () if checked.report.unexplained() => BY_HAND.into(),
+                () if checked.report.unexplained() => why(&checked.report).into(),
                 () if wrong.all(|c| c.corrected) => format!(
                     "picofarm capture calibrate {} --out DIR corrects it",
                     picofarm_proto::show::path(folder)
                 ),
-                () => "correct what is named above, and import the capture again".into(),
+                () => AGAIN.into(),
             };
             Err(CliError::new(Code::Failed, what).hint(hint))
         }
@@ -73,10 +96,10 @@ pub fn calibrate(folder: &Path, out: &Path, output: Output) -> Result<()> {
             format!("{}: {}", folder.display(), describe(&checked.report))
         });
         let what = format!(
-            "{}: no correction explains the times, so that nothing is written",
+            "{}: no correction can be trusted, so that nothing is written",
             folder.display()
         );
-        return Err(CliError::new(Code::Failed, what).hint(BY_HAND));
+        return Err(CliError::new(Code::Failed, what).hint(why(&checked.report)));
     }
     let picture = calibration_picture::draw(&checked, &capture);
     correct(&mut capture, &checked);

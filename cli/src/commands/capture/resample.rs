@@ -30,12 +30,13 @@ pub fn run(args: &CaptureResample, output: Output) -> Result<()> {
     write(&made, &args.out)?;
     let mut facts = show::facts(&made);
     facts["out"] = json!(args.out);
-    let before = capture.origin.outside;
+    let before = &capture.origin;
     output.result(&facts, || {
-        let lost = made.origin.outside - before;
+        let outside = made.origin.outside - before.outside;
+        let cropped = made.origin.cropped - before.cropped;
         let text = show::describe(&made);
         format!(
-            "{}: {text}  outside the new gate and image: {lost:.4e}\n",
+            "{}: {text}  outside the new gate: {outside:.4e}; of pixels outside the new image: {cropped:.4e}\n",
             args.out.display()
         )
     });

@@ -103,6 +103,7 @@ pub fn facts(capture: &Capture) -> Value {
         "laser_m": capture.laser,
         "depth": capture.depth.is_some(),
         "outside": capture.origin.outside,
+        "cropped": capture.origin.cropped,
         "conversions": capture.origin.conversions,
         "spots": beams.collect::<Vec<_>>(),
     });
@@ -142,6 +143,12 @@ pub fn describe(capture: &Capture) -> String {
         text += &format!(
             "  outside the gate: {:.4e}, {share:.2} % of the light of the files\n",
             capture.origin.outside
+        );
+    }
+    if capture.origin.cropped > 0.0 {
+        text += &format!(
+            "  of pixels that were cropped away: {:.4e}\n",
+            capture.origin.cropped
         );
     }
     text

@@ -80,6 +80,7 @@ fn task(args: &DatasetReprocess) -> Result<ReprocessTask> {
         spots: args.spots.clone(),
         sensor: sensor::settings(&args.sensor)?,
         drop_left_over: args.drop_left_over,
+        on_counts: args.on_counts,
         seed: args.seed,
         version: sensor_version(),
     };

@@ -26,7 +26,10 @@ pub struct Flash {
     pub spots: Vec<Spot>,
     /// Index of each spot's beam: beams that meet nothing have none.
     pub beams: Vec<usize>,
+    /// Pixels with a stated spot are 0 here: their depth is part of the input.
     depth: Option<Vec<f32>>,
+    /// The number of these pixels, of those whose depth is known.
+    given: usize,
     specular: Vec<u8>,
     visibility: Vec<u8>,
 }
@@ -106,7 +109,12 @@ impl Flash {
                 }),
             })
         };
-        let spots = beams.iter().filter_map(spot).collect();
+        let spots: Vec<Spot> = beams.iter().filter_map(spot).collect();
+        let mut depth = depth;
+        let given = match &mut depth {
+            Some(depth) => without_spots(depth, &camera, &spots),
+            None => 0,
+        };
         Ok(Self {
             attributes,
             histogram,
@@ -116,6 +124,7 @@ impl Flash {
             spots,
             beams,
             depth,
+            given,
             specular,
             visibility,
         })
@@ -132,14 +141,54 @@ impl Flash {
         }
     }
 
-    /// What it is compared with, where the group holds it.
+    /// What it is compared with, where the group holds it. Pixels with a stated spot are not
+    /// compared, because a method takes their depth from the spot.
     pub fn truth(&self) -> Option<Truth<'_>> {
-        Some(Truth {
-            depth_m: self.depth.as_deref()?,
+        let depth_m = self.depth.as_deref()?;
+        depth_m.iter().any(|z| *z > 0.0).then_some(Truth {
+            depth_m,
             specular: &self.specular,
             visibility: &self.visibility,
         })
     }
+
+    /// Returns why errors of depth are missing, or leave pixels out.
+    pub fn note(&self) -> Option<String> {
+        if self.given == 0 {
+            return None;
+        }
+        let text = match self.truth() {
+            None => {
+                "no error of depth: each pixel whose depth is known has a stated spot, so that input would be compared \
+                 with itself; `demultiplex --places returns` looks for the spots in the histogram and is compared"
+                    .into()
+            }
+            Some(_) => format!(
+                "{} pixels with a stated spot are left out of the error of depth, because their depth is input",
+                self.given
+            ),
+        };
+        Some(text)
+    }
+}
+
+/// Sets the depth of pixels with a stated spot to 0, unknown. Returns the number of pixels whose
+/// depth was known.
+fn without_spots(depth: &mut [f32], camera: &Camera, spots: &[Spot]) -> usize {
+    let i = &camera.intrinsics;
+    let mut given = 0;
+    for place in spots.iter().filter_map(|spot| spot.place) {
+        let q = camera.to_camera(place.point);
+        let (u, v) = (i.fx * q.x / q.z + i.cx, i.fy * q.y / q.z + i.cy);
+        let inside =
+            q.z > 0.0 && (0.0..i.width as f32).contains(&u) && (0.0..i.height as f32).contains(&v);
+        if inside {
+            let known = &mut depth[v as usize * i.width as usize + u as usize];
+            given += usize::from(*known > 0.0);
+            *known = 0.0;
+        }
+    }
+    given
 }
 
 /// The true depth of a capture whose files have it.
@@ -231,13 +280,31 @@ mod tests {
             let truth = flash.truth();
             assert_eq!(truth.is_some(), made.depth.is_some());
             if let Some(truth) = truth {
-                assert_eq!(Some(truth.depth_m.to_vec()), made.depth);
+                // The spot is in the middle of the second row.
+                assert_eq!(truth.depth_m, [2.0, 2.0, 2.0, 2.0, 0.0, 2.0]);
+                assert!(flash.note().unwrap().starts_with("1 pixels"));
                 // Neither shadows nor mirrors are known.
                 assert!(truth.visibility.is_empty() && truth.specular.is_empty());
             }
             let returns = Flash::read(&out, PlacesArg::Returns).unwrap();
             assert!(returns.spots.iter().all(|s| s.place.is_none()));
+            assert_eq!(returns.depth, made.depth);
             std::fs::remove_dir_all(out).unwrap();
         }
+    }
+
+    #[test]
+    fn depth_that_is_known_only_where_spots_are_is_no_truth() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut made = capture(Some(vec![0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+        made.beams.truncate(1);
+        made.per_spot = None;
+        block_on(made.write(&folder.path().join("out"), b"picture")).unwrap();
+        let read = |places| Flash::read(&folder.path().join("out"), places).unwrap();
+        let given = read(PlacesArg::Given);
+        assert!(given.truth().is_none());
+        assert!(given.note().unwrap().starts_with("no error of depth"));
+        let found = read(PlacesArg::Returns);
+        assert!(found.truth().is_some() && found.note().is_none());
     }
 }

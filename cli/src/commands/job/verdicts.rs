@@ -18,7 +18,14 @@ const LINES: u32 = 10_000;
 /// number.
 const EACH: usize = 4;
 /// Kinds of stages with verdicts.
-const KINDS: [&str; 5] = ["demultiplex", "evaluate", "import", "infer", "reconstruct"];
+const KINDS: [&str; 6] = [
+    "calibrate",
+    "demultiplex",
+    "evaluate",
+    "import",
+    "infer",
+    "reconstruct",
+];
 
 /// A line, and whether it is a warning.
 pub type Line = (bool, String);

@@ -5,7 +5,9 @@ use std::time::Instant;
 
 use futures::executor::block_on;
 use picofarm_dataset::SingleRender;
-use picofarm_demultiplex::{Settings as FlashSettings, VERSION, demultiplex, residual, score};
+use picofarm_demultiplex::{
+    Settings as FlashSettings, Truth, VERSION, demultiplex, residual, score,
+};
 use picofarm_figures::{Canvas, TEXT, inferno, scene::quantile};
 use picofarm_reconstruct::{
     Measured, Reconstructed,
@@ -143,8 +145,21 @@ fn make(args: &Reconstruct, watch: &Watch) -> Result<Made> {
     if let Some(networks) = networks {
         metrics["mlp"] = networks;
     }
+    let captured = separated.is_none();
     if let Some(facts) = separated {
         metrics["flash"] = facts;
+    }
+    // The depths of one flash are compared before the surface is fitted, and stand in its facts.
+    if let Some(truth) = flash.truth().filter(|_| captured) {
+        let measured = &reconstructed.measured;
+        let range = &reconstructed.depth.range;
+        let z: Vec<f32> = (0..range.len())
+            .map(|p| range[p] * measured.ray(p).dot(measured.camera.forward))
+            .collect();
+        metrics["depth"] = json!(depth_of_known(&z, &truth));
+    }
+    if let Some(note) = flash.note() {
+        metrics["note"] = json!(note);
     }
     let renderer = Renderer::new(&reconstructed.field);
     let (range, side) = (&reconstructed.depth.range, CELL as u32);
@@ -161,6 +176,28 @@ fn make(args: &Reconstruct, watch: &Watch) -> Result<Made> {
         metrics,
         seconds: [measuring, fitting, 0.0],
     })
+}
+
+/// The error of depths, and the share of the pixels of known depth that have none.
+fn depth_of_known(z: &[f32], truth: &Truth) -> Value {
+    let known: Vec<f32> = truth
+        .depth_m
+        .iter()
+        .zip(z)
+        .map(|(t, z)| if z.is_finite() { *t } else { 0.0 })
+        .collect();
+    let count = |all: &[f32]| all.iter().filter(|z| **z > 0.0).count();
+    let (with, all) = (count(&known), count(truth.depth_m));
+    let truth = Truth {
+        depth_m: &known,
+        ..*truth
+    };
+    let mut found = match with {
+        0 => json!({}),
+        _ => json!(score::depth(z, &truth)),
+    };
+    found["without"] = json!(1.0 - with as f64 / all as f64);
+    found
 }
 
 /// Takes the light of all spots apart. Returns the measurements, and how well the histogram and,
@@ -270,14 +307,26 @@ fn summary(args: &Reconstruct, made: &Made) -> String {
         made.mesh.triangles.len(),
         m["spots"]
     );
-    if let Some(depth) = m["flash"]["depth"].as_object() {
-        let of = |name: &str| depth[name].as_f64().unwrap_or(0.0);
+    let depth = match m["depth"].is_object() {
+        true => &m["depth"],
+        false => &m["flash"]["depth"],
+    };
+    let figure = |name: &str| depth[name].as_f64();
+    if let (Some(mae), Some(median), Some(over)) =
+        (figure("mae_m"), figure("median_m"), figure("over_5cm"))
+    {
         text += &format!(
-            "  depth: MAE {:.4} m, median {:.1} mm, {:.1} % off by more than 5 cm\n",
-            of("mae_m"),
-            of("median_m") * 1e3,
-            of("over_5cm") * 100.0
+            "  depth: MAE {mae:.4} m, median {:.1} mm, {:.1} % off by more than 5 cm",
+            median * 1e3,
+            over * 100.0
         );
+        text += &match figure("without") {
+            Some(without) => format!("; {:.1} % have none\n", without * 100.0),
+            None => "\n".to_owned(),
+        };
+    }
+    if let Some(note) = m["note"].as_str() {
+        text += &format!("  note: {note}\n");
     }
     let [measuring, fitting, _] = made.seconds.map(duration);
     text += &format!("  measurements {measuring}, reconstruction {fitting}\n");

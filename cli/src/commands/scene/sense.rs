@@ -2,18 +2,20 @@
 
 use std::{path::Path, time::Instant};
 
+use futures::executor::block_on;
 use picofarm_dataset::{RenderArray, RenderGroup, write_render_group};
 use picofarm_sensor::{
     Frame, Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values,
     narrow, sense_image,
 };
+use picofarm_tasks::counts;
 use picofarm_transient::Gate;
 use serde_json::{Map, Value, json};
 
 use super::sensor;
 use crate::{
     args::SceneSense,
-    commands::rendered::{self, Folder},
+    commands::rendered::{self, Folder, unreadable},
     error::{CliError, Code, Result},
     output::{Output, duration, files},
 };
@@ -65,6 +67,15 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
     ];
     let bins = gate.bins as usize;
     let transient = rendered::transient(dir, &render)?;
+    let manifest = block_on(render.dataset.manifest(0)).map_err(|e| unreadable(dir, e))?;
+    let counted = counts::are_counts(&transient, manifest.scale, &manifest.provenance.plan);
+    if let Some(field) = sensor.disturbs().filter(|_| counted && !args.on_counts) {
+        let what = format!("{}: {}", dir.display(), counts::refusal(field));
+        return Err(CliError::input(what).hint(
+            "to sum bins or zones only: --pulse none --jitter-ps 0 --photons-per-unit 1 --no-poisson; to add the \
+             sensor's noise all the same: --on-counts",
+        ));
+    }
     // Only a scale by peak depends on the two-bounce part, and zones see the spots as well.
     let by_peak = !matches!(sensor.scale, Scale::Fixed { .. });
     let two = match by_peak && sensor.zones.is_none() && group.has("two") {
@@ -139,7 +150,19 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
     if dropped.pile_up_photons > 0.0 {
         text += &format!(", {:.2e} lost to pile-up", dropped.pile_up_photons);
     }
-    let notes = notes(args, sensor, gate, spec.spots);
+    let mut notes = notes(args, sensor, gate, spec.spots);
+    if counted && sensor.disturbs().is_some() {
+        notes.push(
+            "the histograms are photon counts: they have their own pulse and noise, and the sensor's come on top (--on-counts)"
+                .into(),
+        );
+    }
+    if spec.per_spot {
+        notes.push(
+            "the result has the histogram of all spots alone; the histograms of each spot are not measured"
+                .into(),
+        );
+    }
     for note in &notes {
         text += &format!("\n  note: {note}");
     }

@@ -113,7 +113,7 @@ fn pulse(text: &str) -> Result<Pulse> {
 fn measured(path: &Path) -> Result<Pulse> {
     let text = files::read_text(path, files::SETTINGS)?;
     let failed = |line: usize, what: String| {
-        CliError::input(format!("{}: line {line}: {what}", path.display())).hint(
+        CliError::input(format!("--pulse file:{}: line {line}: {what}", path.display())).hint(
             "e.g. -8,0.1 then 0,0.7 then 8,0.2: a time in picoseconds and an energy, in equal steps, time 0 among them",
         )
     };

@@ -5,6 +5,7 @@
 //! [`super::file`] puts before a render stage, the trials of [`super::sweep`], recipes and repairs
 //! of rendered, reprocessed or imported scenes, and the verdicts that `job watch` prints.
 
+mod calibrate;
 pub mod demultiplex;
 mod division;
 pub mod evaluate;
@@ -35,6 +36,7 @@ use serde::Serialize;
 use super::spec_error::SpecError;
 use crate::show;
 
+pub use calibrate::{CalibrateSettings, CalibrateTask};
 pub use demultiplex::{DemultiplexSettings, DemultiplexTask};
 pub use division::Division;
 pub use evaluate::{EvaluateShardTask, EvaluateTask};
@@ -148,6 +150,8 @@ kinds! {
     EvaluateShard(EvaluateShardTask),
     /// Predicts scenes by physics from the histogram of all spots: one task each.
     Demultiplex(DemultiplexTask),
+    /// Checks and corrects the calibration of a measured scene: one task.
+    Calibrate(CalibrateTask),
 }
 
 /// A kind, for reading job files.

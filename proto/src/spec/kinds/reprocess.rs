@@ -145,6 +145,10 @@ pub struct ReprocessSettings {
     /// it must divide the number of bins.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub drop_left_over: bool,
+    /// Whether photon counts get the sensor's pulse, scale and noise on top of their own.
+    /// Otherwise such a sensor is refused for photon counts.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub on_counts: bool,
     /// Selects another draw of the same noise (default 0).
     pub seed: u64,
     /// Version of the sensor model and the encoder, part of every task key; filled in at submission

@@ -30,7 +30,7 @@ impl Coding {
             Quantity::Transient => "overflow".to_owned(),
             _ => format!("subsets.{}.overflow", quantity.name()),
         };
-        let decoded_units = "1/(m2 sr), radiance per unit pulse energy in each bin";
+        let decoded_units = "of a render: 1/(m2 sr), radiance per unit pulse energy in each bin; of measured files: theirs, photons or energy";
         let mut attributes = match spec.profile {
             Profile::SqrtU16 { delta } => json!({
                 "long_name": format!("transient histogram{of}, square-root code"),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::layout::quantity::Quantity;
-use crate::layout::record::Provenance;
+use crate::layout::record::{Intrinsics, Provenance, Spot, SubsetRecord};
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::{Content, EncodedScene, assemble, intensity};
@@ -63,6 +63,23 @@ impl Dataset {
         scale: f32,
         provenance: &Provenance,
     ) -> Result<EncodedScene, StorageError> {
+        self.encode_derived_with(scene, truth, (transient, &[]), scale, provenance)
+    }
+
+    /// Encodes the same with the histograms of each spot alone, if this data set has them, after
+    /// that of all spots.
+    ///
+    /// # Errors
+    /// Those of [`Self::encode_derived`]; [`StorageError::Invalid`] if histograms of single spots
+    /// are missing, or have another size.
+    pub fn encode_derived_with(
+        &self,
+        scene: u64,
+        truth: &SceneTruth,
+        (transient, spots): (&[f32], &[&[f32]]),
+        scale: f32,
+        provenance: &Provenance,
+    ) -> Result<EncodedScene, StorageError> {
         self.check_scene(scene)?;
         let spec = &self.spec;
         let (ours, theirs) = (
@@ -75,15 +92,21 @@ impl Dataset {
             );
             return Err(StorageError::invalid("truth", what));
         }
-        if spec
-            .quantities()
-            .iter()
-            .filter(|q| q.is_transient())
-            .count()
-            != 1
-        {
-            let what = "a derived data set has one histogram a scene; found subsets of spots too";
+        let other = |q: &Quantity| {
+            q.is_transient() && !matches!(q, Quantity::Transient | Quantity::TransientSpots)
+        };
+        if spec.quantities().iter().any(other) {
+            let what = "a derived data set has the histograms of all spots and of each; found subsets of spots too";
             return Err(StorageError::invalid("spec.subsets", what));
+        }
+        let planes = if spec.per_spot { spec.spots } else { 0 };
+        if spots.len() != planes as usize || spots.iter().any(|h| h.len() != spec.transient_len()) {
+            let what = format!(
+                "expected {planes} histograms of {} values, found {}",
+                spec.transient_len(),
+                spots.len()
+            );
+            return Err(StorageError::invalid("transient_spots", what));
         }
         if spec.two_bounce != truth.spec.two_bounce {
             let what = "one of both has two-bounce paths, the other has not";
@@ -98,9 +121,13 @@ impl Dataset {
             let what = format!("expected a positive finite number, found {scale}");
             return Err(StorageError::invalid("scale", what));
         }
+        let subset = SubsetRecord {
+            quantity: Quantity::TransientSpots,
+            planes: spots.to_vec(),
+        };
         let content = Content {
             transient,
-            subsets: &[],
+            subsets: std::slice::from_ref(&subset),
             scale,
         };
         assemble(self, scene, &content, provenance, |quantity| {
@@ -114,6 +141,35 @@ impl Dataset {
 }
 
 impl SceneTruth {
+    /// Returns the ground truth with another calibration: spots, intrinsics, and the laser in the
+    /// camera's frame.
+    ///
+    /// # Errors
+    /// [`StorageError::Invalid`] for another number of spots.
+    pub fn calibrated(
+        mut self,
+        spots: &[Option<Spot>],
+        intrinsics: Intrinsics,
+        laser: [f32; 3],
+    ) -> Result<Self, StorageError> {
+        if spots.len() != self.spec.spots as usize {
+            let what = format!("expected {} spots, found {}", self.spec.spots, spots.len());
+            return Err(StorageError::invalid("spots", what));
+        }
+        let (i, mut put) = (intrinsics, |quantity, values: &[f32]| {
+            let bytes = values.iter().flat_map(|x| x.to_ne_bytes()).collect();
+            self.arrays.insert(quantity, bytes);
+        });
+        let row = |spot: &Option<Spot>| spot.map_or([f32::NAN; 7], |s| s.row());
+        put(
+            Quantity::Spots,
+            &spots.iter().flat_map(row).collect::<Vec<f32>>(),
+        );
+        put(Quantity::Intrinsics, &[i.fx, i.fy, i.cx, i.cy]);
+        put(Quantity::Laser, &laser);
+        Ok(self)
+    }
+
     /// Returns the ground truth with only the given spots, in the given order.
     ///
     /// # Errors

@@ -2,6 +2,7 @@
 
 mod captures;
 mod captures_of_tools;
+mod captures_words;
 #[path = "../../../dataset/tests/it/common/mod.rs"]
 mod common;
 mod consumer_nlos;

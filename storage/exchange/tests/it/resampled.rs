@@ -59,7 +59,7 @@ proptest! {
     }
 
     #[test]
-    fn photons_are_kept_or_counted_as_outside(
+    fn photons_are_kept_or_counted_as_outside_or_cropped(
         capture in captures(), start in -1.0..10.0f64, width in 0.01..0.5f64, bins in 1u32..40,
         scale in 0.2..3.0f64, pad in 0u32..4, centre in any::<bool>(),
     ) {
@@ -69,11 +69,21 @@ proptest! {
             crop: Some(crop), pad: [pad, 0, 1, pad], centre,
         };
         let made = capture.resampled(&to).unwrap();
-        let (before, after) = (total(&capture.sum), total(&made.sum) + made.origin.outside);
+        let lost = made.origin.outside + made.origin.cropped;
+        let (before, after) = (total(&capture.sum), total(&made.sum) + lost);
         prop_assert!((before - after).abs() <= 1e-4 * before.max(1.0), "{before} became {after}");
         prop_assert_eq!(made.sum.len(), (made.width * made.height * made.gate.bins) as usize);
         let apart = total(made.per_spot.as_deref().unwrap());
         prop_assert!((apart - total(&made.sum)).abs() <= 1e-4 * apart.max(1.0));
+    }
+
+    #[test]
+    fn a_crop_alone_puts_nothing_outside_the_gate(capture in captures()) {
+        let crop = Some([0, 0, capture.width, capture.height.div_ceil(2)]);
+        let made = capture.resampled(&Resampling { crop, ..Resampling::default() }).unwrap();
+        prop_assert_eq!(made.origin.outside, capture.origin.outside);
+        let lost = made.origin.cropped - capture.origin.cropped;
+        prop_assert!((total(&made.sum) + lost - total(&capture.sum)).abs() <= 1e-3);
     }
 
     #[test]
@@ -82,7 +92,7 @@ proptest! {
         prop_assert_eq!(total(&wide.sum), total(&capture.sum));
         let back = Resampling { crop: Some([pad[0], pad[1], capture.width, capture.height]), ..Resampling::default() };
         let mut back = wide.resampled(&back).unwrap();
-        prop_assert_eq!(back.origin.outside, 0.0);
+        prop_assert_eq!((back.origin.outside, back.origin.cropped), (0.0, 0.0));
         // The principal point moved there and back in 32 bits.
         prop_assert!((back.intrinsics.cx - capture.intrinsics.cx).abs() < 1e-4);
         prop_assert!((back.intrinsics.cy - capture.intrinsics.cy).abs() < 1e-4);

@@ -1,11 +1,11 @@
 //! Captures that no correction covers, impossible geometry, shadows, padding and wide pulses.
 
-use picofarm_calibrate::{Fault, Verdict};
+use picofarm_calibrate::{Fault, Measurement, Verdict, check};
 use picofarm_scene::Intrinsics;
-use picofarm_settings::Pulse;
+use picofarm_settings::{Gate, Pulse};
 
 use crate::{
-    common::{Capturing, GATE},
+    common::{self, Capturing, GATE, Room},
     laws::{PHOTONS, SIDE, checked, named, room},
 };
 
@@ -56,6 +56,88 @@ fn faults_that_no_correction_covers_are_wrong_and_nothing_is_corrected() {
         assert_eq!(found.corrected.camera, capture.camera, "{name}");
         assert_eq!(found.corrected.spots, capture.spots, "{name}");
     }
+}
+
+/// Verdicts on all [`common::doubts`] of a room of 32×32 pixels: name, verdict, whether the
+/// calibration is right.
+fn verdicts(
+    spots: u32,
+    rebin: u32,
+    photons: f64,
+    apart: bool,
+) -> Vec<(String, Verdict, Option<bool>)> {
+    let fine = Gate {
+        start_m: 1.0,
+        bin_width_m: 0.012,
+        bins: 1024,
+    };
+    let room = Room::in_gate(7, 32, 0, spots, fine);
+    let plain = room.measure_in(rebin, photons, 1, |_| {});
+    let verdict = |(name, capture, right): (&str, Capturing, Option<bool>)| {
+        let found = check(&Measurement {
+            capture: capture.capture(),
+            per_spot: apart.then_some(&capture.per_spot),
+            masks: None,
+            pulses: None,
+        });
+        let report = found.expect("a capture").report;
+        let what = format!("{spots} spots, {rebin} bins, {photons} photons, {name}: {report:?}");
+        (what, report.verdict, right)
+    };
+    common::doubts(&plain, apart)
+        .into_iter()
+        .map(verdict)
+        .collect()
+}
+
+#[test]
+fn right_calibrations_are_never_wrong_and_wrong_ones_never_good_however_little_is_seen() {
+    for spots in [1, 4, 16] {
+        for (rebin, photons) in [(1, 100.0), (3, 3.0), (8, 100.0)] {
+            for apart in [true, false] {
+                for (what, verdict, right) in verdicts(spots, rebin, photons, apart) {
+                    match right {
+                        Some(true) => assert_ne!(verdict, Verdict::Wrong, "{what}"),
+                        Some(false) => assert_ne!(verdict, Verdict::Good, "{what}"),
+                        None => assert_eq!(verdict, Verdict::CannotTell, "{what}"),
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_missing_is_named_with_its_figure() {
+    let room = Room::in_gate(7, 32, 0, 4, GATE);
+    let found = checked(&room.measure_in(1, PHOTONS, 1, |_| {}), None);
+    assert_eq!(found.report.verdict, Verdict::CannotTell);
+    assert_eq!(named(&found), [Fault::Evidence]);
+    let finding = &found.report.causes[0].finding;
+    assert!(
+        finding.contains("4 spots") && finding.contains("at least 9"),
+        "{finding}"
+    );
+    assert!(found.report.unexplained());
+}
+
+#[test]
+fn two_spots_with_one_file_are_named() {
+    let mut capture = room().measure(PHOTONS, 1, |_| {});
+    let cells = capture.per_spot.len() / 16;
+    capture
+        .per_spot
+        .copy_within(2 * cells..3 * cells, 5 * cells);
+    capture.add_up();
+    let found = checked(&capture, None);
+    let equal = found
+        .report
+        .causes
+        .iter()
+        .find(|c| c.fault == Fault::EqualHistograms);
+    let equal = equal.expect("named");
+    assert!(equal.finding.contains("spots 2 and 5"), "{}", equal.finding);
+    assert_eq!(found.report.verdict, Verdict::Wrong);
 }
 
 #[test]

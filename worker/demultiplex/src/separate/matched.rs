@@ -1,11 +1,14 @@
 //! The matched filter: correlation with the one-bounce pulse.
 //!
 //! PlatoNeRF's code (`bf_lidar/bf_lidar_depth.py`) takes the place of the maximum as the time, and
-//! log10 of the maximum > −2.5 as lit. Three things differ here. Its histograms have the unit of
+//! log10 of the maximum > −2.5 as lit. Four things differ here. Its histograms have the unit of
 //! one renderer, so that the threshold means nothing for others: here each histogram is divided by
 //! its sum, as in the preprocessing of PlatoNeRF's own method, and the maximum is a density for a
-//! bin of 8 ps. The background is subtracted from the maximum. Its product of spectra lacks the
-//! conjugate, which mirrors the pulse in time: here it is a correlation.
+//! bin of 8 ps. The published threshold is that of the published pulse: a narrower pulse, such as
+//! that of a render without one, correlates more with any light, so that the threshold grows with
+//! the correlation of the pulse with itself. The background is subtracted from the maximum. Its
+//! product of spectra lacks the conjugate, which mirrors the pulse in time: here it is a
+//! correlation.
 
 use rayon::prelude::*;
 
@@ -13,6 +16,9 @@ use super::returns::{Return, Timing, UNIT_M, brightest};
 
 /// Least log10 of the correlation of a lit pixel.
 const THRESHOLD_LOG10: f32 = -2.5;
+/// Correlation with itself of a pulse of 128 ps, as density for a bin of 8 ps: the published
+/// threshold is a share of 6 % of it.
+const OWN_PUBLISHED: f32 = 0.05;
 /// Share of the peak at which the pulse ends on both sides.
 const END: f32 = 0.01;
 
@@ -65,6 +71,7 @@ pub fn returns(histogram: &[f32], timing: &Timing, out: &mut [Return]) {
     let bins = timing.gate.bins as usize;
     let pulse = Pulse::new(histogram, timing);
     let density = (UNIT_M / timing.gate.bin_width_m) as f32;
+    let narrower = (density * pulse.own / OWN_PUBLISHED).max(1.0);
     out.par_iter_mut()
         .zip(histogram.par_chunks(bins))
         .for_each(|(found, h)| {
@@ -72,7 +79,7 @@ pub fn returns(histogram: &[f32], timing: &Timing, out: &mut [Return]) {
             let light: Vec<f32> = h.iter().map(|x| x - b).collect();
             let sum: f32 = h.iter().sum();
             let (bin, c) = pulse.greatest(&light);
-            let score = density * c / sum;
+            let score = density * c / sum / narrower;
             let lit = sum > 0.0 && score > 0.0 && libm::log10f(score) > THRESHOLD_LOG10;
             *found = Return {
                 lit,

@@ -116,6 +116,35 @@ fn depth_is_right_to_millimetres_and_masks_are_the_true_ones() {
 }
 
 #[test]
+fn without_a_pulse_later_bounces_light_nothing_for_the_matched_filter() {
+    let (room, blurred) = rooms(false);
+    let (bins, laser) = (GATE.bins as usize, Vec3::new(0.08, 0.0, 0.0));
+    let captures: Vec<Vec<f32>> = grid(3)
+        .iter()
+        .zip(&blurred)
+        .map(|(place, blurred)| {
+            let spot = std::slice::from_ref(place);
+            let lit = |_: usize, _: usize| true;
+            let sharp = Room::shaped(SIDE, spot, Some(plate()), GATE, laser, SHAPE, lit).histogram;
+            // Every pixel sees light of three and more bounces, over 150 bins.
+            let mut all: Vec<f32> = sharp.iter().map(|x| PHOTONS * x).collect();
+            let mut usual: Vec<f32> = blurred.chunks(bins).map(|h| h.iter().sum()).collect();
+            usual.sort_by(f32::total_cmp);
+            let usual = usual[usual.len() / 2];
+            for h in all.chunks_mut(bins) {
+                let later = h.iter_mut().skip(600).take(150);
+                later.for_each(|x| *x += 0.3 * usual / 150.0);
+            }
+            all
+        })
+        .collect();
+    let found = found(&room, &captures, Separate::MatchedFilter, true);
+    let (depth, masks) = errors(&room, &found);
+    assert!(depth < 0.006, "{depth} m");
+    assert!(masks > 0.95, "{masks}");
+}
+
+#[test]
 fn a_spot_in_the_dark_lights_nothing_and_the_others_answer() {
     let (room, mut captures) = rooms(false);
     captures[4].fill(0.0);

@@ -6,14 +6,16 @@ use crate::common;
 use common::{Unstopped, room, small};
 use picofarm_reconstruct::{
     Agreement, Measured, ReconstructError, Reconstruction, Settings, Unwatched, Verdict,
-    source::{Disturbed, from_truth, truth_of},
+    source::{CaptureSettings, Disturbed, captures_of, from_truth, truth_of},
 };
 use picofarm_scene::{
-    Scene, Vec3,
+    AssetLibrary, Scene, Vec3,
+    furnished::{self, FurnishedSettings},
     plato::PlatoObject,
     primitive::{PrimitiveSettings, generate},
 };
-use picofarm_transient::Rendered;
+use picofarm_settings::{FloorPlan, Spots};
+use picofarm_transient::{Gate, Rendered};
 
 const BINS: Disturbed = Disturbed {
     bin_width_m: 0.0384,
@@ -152,6 +154,62 @@ fn a_gate_that_is_off_by_a_bin_is_doubtful_and_stated() {
     let found = begun(measured).unwrap();
     assert_eq!(found.verdict, Verdict::Doubtful, "{found:?}");
     assert!(found.reasons[0].contains("too late"), "{found:?}");
+}
+
+#[test]
+fn late_times_of_one_part_of_the_image_are_no_shifted_clock() {
+    let (scene, rendered) = room(PlatoObject::Chair, 16, 48);
+    let mut measured = from_truth(&scene, &rendered, &BINS).unwrap();
+    let pixels = measured.pixels();
+    // Light of three bounces by way of the wall on the right arrives 15 cm later.
+    for q in 0..measured.lit.len() {
+        if q % pixels % 48 >= 20 && measured.lit[q] != 0 {
+            measured.tau[q] += 0.15 * ((q / pixels) % 2) as f32;
+        }
+    }
+    let said = match begun(measured) {
+        Ok(found) => found.reasons.join("; "),
+        Err(refused) => refused,
+    };
+    assert!(!said.contains("where the gate begins"), "{said}");
+}
+
+#[test]
+fn light_of_three_bounces_in_rooms_of_other_shapes_is_no_shifted_clock() {
+    let library = AssetLibrary::parametric();
+    let gate = Gate {
+        start_m: 1.0,
+        bin_width_m: 0.0384,
+        bins: 400,
+    };
+    let settings = CaptureSettings {
+        gate,
+        samples: 4,
+        seed: 1,
+        sensor: None,
+    };
+    for seed in [1, 3, 4] {
+        let room = FurnishedSettings {
+            spots: Spots::Grid(16),
+            width: 48,
+            height: 48,
+            floor_plan: FloorPlan::Varied,
+            ..FurnishedSettings::default()
+        };
+        let scene = furnished::generate(seed, &room, &library).unwrap();
+        let right = captures_of(&scene, &settings, &|_, _| true).unwrap();
+        let said = |by: f32| {
+            let mut measured = right.clone();
+            late(&mut measured, by);
+            match begun(measured) {
+                Ok(found) => found.reasons.join("; "),
+                Err(refused) => refused,
+            }
+        };
+        let clock = "where the gate begins";
+        assert!(!said(0.0).contains(clock), "seed {seed}: {}", said(0.0));
+        assert!(said(0.15).contains(clock), "seed {seed}: {}", said(0.15));
+    }
 }
 
 /// In an open room most pixels are lit by every spot, so with inverted masks they are dark. In

@@ -1,6 +1,7 @@
 //! Inputs of tasks: scenes, examples for networks, ground truth, times and models.
 
 pub(crate) mod camera;
+pub mod counts;
 #[cfg(feature = "networks")]
 pub(crate) mod examples;
 #[cfg(feature = "networks")]

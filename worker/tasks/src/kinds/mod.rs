@@ -1,6 +1,7 @@
 //! The code that runs each kind of task. A kind imports only modules below this folder, and no
 //! other kind. [`picofarm_proto::spec::kinds`] documents the kinds.
 
+mod calibrate;
 pub mod demultiplex;
 #[cfg(feature = "networks")]
 mod evaluate;

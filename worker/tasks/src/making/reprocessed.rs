@@ -18,7 +18,7 @@ use tracing::debug_span;
 
 use crate::{
     errors::dataset_error,
-    input::{quantity, source_manifest},
+    input::{counts, quantity, source_manifest},
     stores::{Stores, manifest_sha256},
     task::{Control, TaskError, proceed},
 };
@@ -96,6 +96,18 @@ impl Reprocessing {
         let h = debug_span!(target: trace::TARGET, "read")
             .in_scope(|| read(stores, source, settings, index, control))?;
         proceed(control, READ)?;
+        if let Some(field) = self.sensor.disturbs()
+            && !settings.on_counts
+            && counts::are_counts(&h, self.found.scale, &self.found.provenance.plan)
+        {
+            return Err(TaskError::User(format!(
+                "reprocess.sensor: scene {index} of {}: {}; to sum bins or spots only, set pulse = {{ kind = \"none\" }}, \
+                 jitter = {{ kind = \"gaussian\", fwhm_ps = 0.0 }}, scale = {{ kind = \"fixed\", photons_per_unit = 1.0 }} and \
+                 poisson = false; to add the sensor's noise all the same, set reprocess.on_counts = true (--on-counts)",
+                source.place(),
+                counts::refusal(field)
+            )));
+        }
         let input = Histograms {
             transient: &h,
             two_bounce: None,

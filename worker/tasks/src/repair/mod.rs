@@ -336,6 +336,8 @@ impl Repairer {
             histogram,
             sensor: serde_json::from_value(plan["sensor"].clone()).map_err(unusable)?,
             drop_left_over: plan["drop_left_over"] == true,
+            // What was made once was allowed.
+            on_counts: true,
             seed: plan["seed"].as_u64().unwrap_or_default(),
             version: manifest.provenance.renderer.clone(),
             spots: Vec::new(),

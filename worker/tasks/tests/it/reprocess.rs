@@ -56,6 +56,8 @@ impl Place {
                 spots: vec![],
                 sensor,
                 drop_left_over: false,
+                // Some of these sources have whole numbers.
+                on_counts: true,
                 seed: 0,
                 version: sensor_version(),
             },
@@ -235,6 +237,43 @@ fn lively(pixel: usize, bin: usize) -> f32 {
     } else {
         0.05 / (1 + bin - peak) as f32
     }
+}
+
+#[tokio::test]
+async fn photon_counts_get_another_sensors_noise_only_when_asked() {
+    let counts = |p: usize, b: usize| ((p + b) % 5) as f32 / 400.0;
+    let mut place = Place::new(Sensor::default());
+    place.settings.on_counts = false;
+    place.publish(0, counts).await;
+    let TaskError::User(said) = place.run(0).await.unwrap_err() else {
+        panic!("the user's mistake");
+    };
+    for word in [
+        "scene 0",
+        "photon counts",
+        "sensor.pulse",
+        "reprocess.on_counts = true",
+    ] {
+        assert!(said.contains(word), "{word}: {said}");
+    }
+    place.settings.on_counts = true;
+    place.run(0).await.unwrap();
+    let mut place = Place::new(Sensor {
+        scale: Scale::Fixed {
+            photons_per_unit: 1.0,
+        },
+        rebin: 2,
+        ..ideal()
+    });
+    place.settings.on_counts = false;
+    place.publish(0, counts).await;
+    place.run(0).await.unwrap();
+    place.settings.sensor.dark_per_bin = 0.1;
+    place.target.dataset = "another".into();
+    let TaskError::User(said) = place.run(0).await.unwrap_err() else {
+        panic!("the user's mistake");
+    };
+    assert!(said.contains("sensor.dark_per_bin"), "{said}");
 }
 
 #[tokio::test]

@@ -110,7 +110,20 @@ impl Strided {
         let mut found: [Option<(usize, usize)>; 4] = [None; 4];
         let mut channels: Option<(usize, usize)> = None;
         for ((name, size), stride) in names.iter().zip(&self.shape).zip(&self.strides) {
-            let twice = || refused(NAMES.into(), format!("{names:?}"), "name each axis once");
+            let known =
+                ["channel", "pixel"].contains(&name.as_str()) || ORDER.contains(&name.as_str());
+            let twice = || match known {
+                true => refused(
+                    "each axis once, and \"pixel\" instead of \"row\" and \"column\"".into(),
+                    format!("{names:?}"),
+                    "correct \"axes\" in the description, for example [\"row\", \"column\", \"bin\"]",
+                ),
+                false => refused(
+                    NAMES.into(),
+                    format!("{name:?} in {names:?}"),
+                    "correct \"axes\" in the description, for example [\"row\", \"column\", \"bin\"]",
+                ),
+            };
             match name.as_str() {
                 "channel" if channels.is_none() => channels = Some((*size, *stride)),
                 "pixel" if found[1].is_none() && found[2].is_none() => {
@@ -143,7 +156,7 @@ impl Strided {
                 refused(
                     format!("an axis {:?}", ORDER[n]),
                     format!("{names:?}"),
-                    "name it in \"axes\" of the description",
+                    "name it in \"axes\" of the description, for example [\"row\", \"column\", \"bin\"]",
                 )
             })
         };

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use picofarm_files::Opener;
 use serde::Deserialize;
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::super::files::Files;
 use super::super::{ImportError, ImportOptions};
@@ -27,6 +27,39 @@ pub const EXAMPLE: &str = r#"{
   "laser_m": [0.10, 0.0, 0.0],
   "directions": [[-0.30, 0.10, 1.0], [0.25, 0.15, 1.0]]
 }"#;
+
+/// Forms of the fields, each with an example.
+const FORMS: [(&str, &str); 11] = [
+    ("name", "a text, e.g. \"the room\""),
+    (
+        "array",
+        "the name of an array in the file, e.g. \"histograms\"",
+    ),
+    (
+        "axes",
+        "a list of names, e.g. [\"row\", \"column\", \"bin\"]",
+    ),
+    ("pixels", "two whole numbers [rows, columns], e.g. [64, 64]"),
+    (
+        "gate",
+        "numbers by name, e.g. {\"t0_ps\": 14242.8, \"bin_width_ps\": 32.0, \"keep_m\": [0.9, 13.3]}",
+    ),
+    (
+        "camera",
+        "numbers by name, e.g. {\"fov_deg\": 60.0}, or {\"fx\": 55.4, \"fy\": 55.4, \"cx\": 32.0, \"cy\": 32.0}",
+    ),
+    (
+        "frame",
+        "three axes, e.g. [\"right\", \"down\", \"forward\"]",
+    ),
+    ("laser_m", "three numbers in metres, e.g. [0.10, 0.0, 0.0]"),
+    ("depth_m", "the name of a .npy file, e.g. \"depth.npy\""),
+    ("range_m", "the name of a .npy file, e.g. \"range.npy\""),
+    (
+        "events",
+        "columns by name, e.g. {\"time\": \"t\", \"row\": \"y\", \"column\": \"x\", \"time_ps\": 1.0}",
+    ),
+];
 
 /// The file of a description, as it is written.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -209,9 +242,27 @@ impl Described {
         }
         let bytes = reader.bytes(&self.file)?;
         serde_json::from_slice(&bytes).map_err(|e| {
-            let hint = format!("correct the description, for example\n{EXAMPLE}");
-            ImportError::unreadable(&self.file, e, hint)
+            self.wrong_field(&bytes).unwrap_or_else(|| {
+                let hint = format!("correct the description, for example\n{EXAMPLE}");
+                ImportError::unreadable(&self.file, e, hint)
+            })
         })
+    }
+
+    /// Returns the error about the field of a description that has another form than expected.
+    fn wrong_field(&self, bytes: &[u8]) -> Option<ImportError> {
+        let all: Map<String, Value> = serde_json::from_slice(bytes).ok()?;
+        for (name, value) in all {
+            let Some((_, expected)) = FORMS.iter().find(|(known, _)| *known == name) else {
+                continue;
+            };
+            let alone = Value::Object(Map::from_iter([(name.clone(), value.clone())]));
+            if let Err(e) = serde_json::from_value::<Description>(alone) {
+                let found = format!("{value} ({e})");
+                return Some(self.refused(name, *expected, found));
+            }
+        }
+        None
     }
 
     /// Returns the error about a field of the description.

@@ -8,6 +8,7 @@ use picofarm_dataset::{
     write_single_render,
 };
 use picofarm_store::StorageError;
+use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
@@ -30,6 +31,9 @@ const POSE: [[f32; 4]; 4] = [
 ];
 /// Photons in the median pixel's brightest bin, if the values are no counts.
 const PEAK_PHOTONS: f32 = 400.0;
+
+/// Most counts in a bin that 16 bits hold.
+const MOST_COUNTS: f32 = 65_534.0;
 
 /// From the camera's axes to the world's, and back.
 fn turned([x, y, z]: [f32; 3]) -> [f32; 3] {
@@ -60,7 +64,7 @@ impl Capture {
             wavelengths_nm: Wavelength::NONE,
             two_bounce: false,
             gate: self.gate,
-            profile: Profile::LOSSLESS,
+            profile: self.profile(),
         };
         spec.check()?;
         let attributes = self.attributes();
@@ -70,6 +74,22 @@ impl Capture {
             picture,
         };
         write_single_render(dir, &spec, |dataset| self.encode(dataset), &parts).await
+    }
+
+    /// Whether all values are whole numbers: counts of photons.
+    fn counted(&self) -> bool {
+        let whole = |all: &[f32]| all.par_iter().all(|x| x.fract() == 0.0);
+        whole(&self.sum) && self.per_spot.as_deref().is_none_or(whole)
+    }
+
+    /// Counts are stored as such, which names their unit; light in other units bit for bit, and so
+    /// are counts beyond 16 bits.
+    fn profile(&self) -> Profile {
+        // The sum has the greatest counts.
+        match self.counted() && self.sum.par_iter().all(|x| *x <= MOST_COUNTS) {
+            true => Profile::CountsU16,
+            false => Profile::LOSSLESS,
+        }
     }
 
     /// Names of the quantities that the capture does not have.
@@ -112,7 +132,10 @@ impl Capture {
         };
         let attributes = json!({
             "scene": self.name,
-            "value": "as in the files: photons or energy in each bin",
+            "value": match self.counted() {
+                true => "photons: counted in each bin, as in the files",
+                false => "as in the files: photons or energy in each bin",
+            },
             "gate": self.gate,
             "camera": {
                 "intrinsics": {
@@ -128,6 +151,7 @@ impl Capture {
                 "files": self.origin.files,
                 "conversions": self.origin.conversions,
                 "outside": self.origin.outside,
+                "cropped": self.origin.cropped,
                 "missing": self.missing(),
             },
         });
@@ -165,8 +189,7 @@ impl Capture {
                 planes: all.chunks_exact(len).collect(),
             })
             .collect();
-        let counts = self.sum.iter().all(|x| x.fract() == 0.0);
-        let scale = match counts {
+        let scale = match self.counted() {
             true => 1.0,
             false => photon_scale(&self.sum, self.gate.bins as usize, PEAK_PHOTONS),
         };
@@ -266,6 +289,7 @@ impl Capture {
                 files: serde_json::from_value(about["files"].clone()).unwrap_or_default(),
                 conversions: list.filter_map(Value::as_str).map(str::to_owned).collect(),
                 outside: about["outside"].as_f64().unwrap_or(0.0),
+                cropped: about["cropped"].as_f64().unwrap_or(0.0),
             },
         })
     }

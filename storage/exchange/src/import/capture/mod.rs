@@ -93,6 +93,8 @@ pub struct Origin {
     pub conversions: Vec<String>,
     /// Photons (or energy) of the files outside the gate that was kept.
     pub outside: f64,
+    /// Photons (or energy) of pixels that were cropped away.
+    pub cropped: f64,
 }
 
 impl Capture {
@@ -270,6 +272,7 @@ fn finish(
             files: Vec::new(),
             conversions: notes,
             outside: part.outside,
+            cropped: 0.0,
         },
     })
 }

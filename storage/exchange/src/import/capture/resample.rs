@@ -75,20 +75,20 @@ struct Window {
 
 impl Capture {
     /// Returns the capture on another gate, scale and image. Photons are kept: those outside the
-    /// new gate and image are added to [`super::Origin::outside`].
+    /// new gate are added to [`super::Origin::outside`], and those of pixels outside the new image
+    /// to [`super::Origin::cropped`].
     ///
     /// # Errors
     /// [`SensorError::Invalid`] names the field of `to` that is out of range.
     pub fn resampled(&self, to: &Resampling) -> Result<Self, SensorError> {
         let window = self.window(to)?;
         let gate = self.new_gate(to)?;
-        let mut outside = self.origin.outside;
-        let planes = |all: &[f32]| -> Result<(Vec<f32>, f64), SensorError> {
+        let planes = |all: &[f32]| -> Result<(Vec<f32>, [f64; 2]), SensorError> {
             let (cut, dropped) = self.cut(all, self.gate.bins as usize, &window);
             let made = resample(&cut, &self.gate, &gate, to.scale)?;
-            Ok((made.data, dropped + made.outside))
+            Ok((made.data, [made.outside, dropped]))
         };
-        let (sum, gone) = planes(&self.sum)?;
+        let (sum, [outside, cropped]) = planes(&self.sum)?;
         let per_spot = match &self.per_spot {
             None => None,
             Some(all) => Some(planes(all)?.0),
@@ -98,10 +98,10 @@ impl Capture {
             Some(all) => super::arrays::sum(all, self.beams.len()),
             None => sum,
         };
-        outside += gone;
         let i = self.intrinsics;
         let mut origin = self.origin.clone();
-        origin.outside = outside;
+        origin.outside += outside;
+        origin.cropped += cropped;
         if *to != Resampling::default() {
             origin.conversions.push(format!("resampled: {to}"));
         }

@@ -27,6 +27,8 @@ pub const GATE: Gate = Gate {
 /// A rendered room.
 #[derive(Clone)]
 pub struct Room {
+    /// The gate of `light`.
+    pub gate: Gate,
     pub camera: Camera,
     pub laser: Vec3,
     pub directions: Vec<Vec3>,
@@ -43,8 +45,18 @@ impl Room {
     /// Renders the furnished room of a seed with 16 spots and a laser 0.257 m to the right of the
     /// camera.
     pub fn new(seed: u64, side: u32, mirrors: u32) -> Self {
+        let fine = Gate {
+            bin_width_m: GATE.bin_width_m / f64::from(FINE),
+            bins: GATE.bins * FINE,
+            ..GATE
+        };
+        Self::in_gate(seed, side, mirrors, 16, fine)
+    }
+
+    /// The same with this number of spots, in the bins of this gate.
+    pub fn in_gate(seed: u64, side: u32, mirrors: u32, spots: u32, gate: Gate) -> Self {
         let settings = furnished::FurnishedSettings {
-            spots: Spots::Grid(16),
+            spots: Spots::Grid(spots),
             laser_m: [0.257, 0.0, 0.0],
             width: side,
             height: side,
@@ -53,15 +65,10 @@ impl Room {
         };
         let library = AssetLibrary::find("parametric", &[]).expect("built in");
         let scene = furnished::generate(seed, &settings, &library).expect("a room");
-        let gate = Gate {
-            bin_width_m: GATE.bin_width_m / f64::from(FINE),
-            bins: GATE.bins * FINE,
-            ..GATE
-        };
         let settings = transient::Settings {
             one_bounce: true,
             seed,
-            groups: (0..16).map(|k| vec![k]).collect(),
+            groups: (0..spots).map(|k| vec![k]).collect(),
             ..transient::Settings::new(gate, Budget::Samples(16))
         };
         let made = transient::render(&scene, &settings, &Unstopped).expect("a render");
@@ -73,6 +80,7 @@ impl Room {
             }
         });
         Self {
+            gate,
             camera: scene.camera,
             laser: scene.laser.origin,
             directions: scene.laser.beams.iter().map(|b| b.direction).collect(),
@@ -87,13 +95,25 @@ impl Room {
 
     /// What a sensor counts; `photons` is the brightest bin of the median pixel for one spot.
     pub fn measure(&self, photons: f64, seed: u64, change: impl Fn(&mut Sensor)) -> Capturing {
+        self.measure_in(FINE, photons, seed, change)
+    }
+
+    /// The same with this number of the render's bins in a bin of the capture. `photons` are those
+    /// of the brightest such bin.
+    pub fn measure_in(
+        &self,
+        rebin: u32,
+        photons: f64,
+        seed: u64,
+        change: impl Fn(&mut Sensor),
+    ) -> Capturing {
         let mut per_spot = Vec::new();
-        let bins = (GATE.bins * FINE) as usize;
+        let bins = self.gate.bins as usize;
         // One scale for all spots: that of the first.
         let mut tops: Vec<f32> = self.light[0]
             .chunks(bins)
             .map(|h| {
-                let sums = h.chunks(FINE as usize).map(|b| b.iter().sum::<f32>());
+                let sums = h.chunks(rebin as usize).map(|b| b.iter().sum::<f32>());
                 sums.fold(0.0, f32::max)
             })
             .collect();
@@ -104,7 +124,7 @@ impl Room {
                 scale: Scale::Fixed {
                     photons_per_unit: scale,
                 },
-                rebin: FINE,
+                rebin,
                 ..Sensor::default()
             };
             change(&mut sensor);
@@ -112,7 +132,7 @@ impl Room {
                 transient: light,
                 two_bounce: None,
                 bins,
-                bin_width_ps: GATE.bin_width_m / f64::from(FINE) * PS_PER_M,
+                bin_width_ps: self.gate.bin_width_m * PS_PER_M,
             };
             let sensed = sense(&sensor, &light, seed, k as u64).expect("light");
             match sensed.values {
@@ -120,7 +140,12 @@ impl Room {
                 Values::Rate(all) => per_spot.extend(all),
             }
         }
-        Capturing::new(self, per_spot)
+        let gate = Gate {
+            bin_width_m: self.gate.bin_width_m * f64::from(rebin),
+            bins: self.gate.bins / rebin,
+            ..self.gate
+        };
+        Capturing::new(self, gate, per_spot)
     }
 }
 
@@ -136,11 +161,11 @@ pub struct Capturing {
 }
 
 impl Capturing {
-    fn new(room: &Room, per_spot: Vec<f32>) -> Self {
+    fn new(room: &Room, gate: Gate, per_spot: Vec<f32>) -> Self {
         let spots = room.places.iter().zip(&room.directions);
         let mut made = Self {
             camera: room.camera,
-            gate: GATE,
+            gate,
             laser: room.laser,
             spots: spots
                 .map(|(place, direction)| Spot {
@@ -288,6 +313,76 @@ pub fn faults(room: &Room, plain: &Capturing, wanted: impl Fn(&str) -> bool) -> 
         let dead_time = Some(picofarm_sensor::DeadTime::FirstPhoton { pulses: 2000 });
         let piled = room.measure(100.0, 1, |s| s.dead_time = dead_time);
         all.push(("pile-up", piled, masks));
+    }
+    all
+}
+
+/// Right and wrong calibrations of a capture, and captures without information: whether the stated
+/// calibration is right, `None` if nothing can tell. Only histograms of each spot (`apart`) have an
+/// order.
+pub fn doubts(plain: &Capturing, apart: bool) -> Vec<(&'static str, Capturing, Option<bool>)> {
+    let with = |change: &dyn Fn(&mut Capturing)| {
+        let mut made = plain.clone();
+        change(&mut made);
+        made.add_up();
+        made
+    };
+    let cells = plain.per_spot.len() / plain.spots.len();
+    let bins = plain.gate.bins as usize;
+    let side = plain.camera.intrinsics.width as usize;
+    let mut all = vec![
+        ("right", plain.clone(), Some(true)),
+        (
+            "t0 a bin late",
+            with(&|c| c.gate.start_m += c.gate.bin_width_m.max(0.0384)),
+            Some(false),
+        ),
+        (
+            "laser 10 cm right",
+            with(&|c| {
+                let stated = c.laser;
+                c.laser += c.camera.right * 0.1;
+                for place in c.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
+                    let way = (place.point - c.laser).length() - (place.point - stated).length();
+                    place.path_m += way;
+                }
+            }),
+            Some(false),
+        ),
+        (
+            "mirrored in x",
+            with(&|c| {
+                for rows in c.per_spot.chunks_mut(side * bins) {
+                    for u in 0..side / 2 {
+                        let (left, right) = rows.split_at_mut((side - 1 - u) * bins);
+                        left[u * bins..][..bins].swap_with_slice(&mut right[..bins]);
+                    }
+                }
+            }),
+            Some(false),
+        ),
+        (
+            "pure noise",
+            with(&|c| {
+                let mut state = 1u64;
+                for x in &mut c.per_spot {
+                    state = state
+                        .wrapping_mul(6_364_136_223_846_793_005)
+                        .wrapping_add(1);
+                    *x = ((state >> 62) as f32) * (state >> 40 & 3) as f32;
+                }
+            }),
+            None,
+        ),
+        ("dark", with(&|c| c.per_spot.fill(0.0)), None),
+    ];
+    if plain.spots.len() > 1 && apart {
+        all.push(("spots swapped", with(&|c| c.spots.swap(0, 1)), Some(false)));
+        all.push((
+            "two equal files",
+            with(&|c| c.per_spot.copy_within(0..cells, cells)),
+            Some(false),
+        ));
     }
     all
 }

@@ -68,7 +68,7 @@ impl Description {
         described: &Described,
         reader: &Files,
     ) -> Result<Option<Vec<[f64; 3]>>, ImportError> {
-        let expected = "a list of [x, y, z], or the name of a .npy file [spots, 3]";
+        let expected = "a list of [x, y, z] in metres for each spot, e.g. [[-0.3, 0.1, 2.0], [0.25, 0.15, 2.1]], or the name of a .npy file [spots, 3]";
         let rows: Vec<[f64; 3]> = match value {
             Value::Null => return Ok(None),
             Value::String(name) => {
