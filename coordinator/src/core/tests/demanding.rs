@@ -1,7 +1,7 @@
 //! Demand follows the rules of leases: there is demand exactly if a new worker of the shape could
 //! get a task.
 
-use picofarm_proto::messages::Abilities;
+use picofarm_proto::messages::{Abilities, FailureKind};
 use proptest::prelude::*;
 
 use super::{
@@ -128,6 +128,35 @@ fn idle_workers_count_once_and_tasks_that_do_not_fit_are_refused_with_the_reason
         let other = world.demand(Abilities::default(), None);
         let why = other.stages[0].refused.as_deref().unwrap_or_default();
         assert!(why.contains("the worker runs no render tasks"), "{other:?}");
+        world.close().await;
+    });
+}
+
+#[test]
+fn tasks_that_were_interrupted_after_long_wait_for_workers_that_run_longer() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let mut world = World::on_sqlite(folder.path()).await;
+        world.connect(0, 0).await;
+        let abilities = world.abilities(0);
+        world.act(&Op::Credit(0)).await;
+        let lease = world.workers[0].leases[0].clone();
+        world.act(&Op::Beat(0)).await;
+        world.act(&Op::Pass(500)).await;
+        let cut = FailureKind::Interrupted;
+        world.fail(&lease, lease.lo, cut).await;
+        // The pause before the next attempt.
+        world.act(&Op::Pass(200)).await;
+        world.act(&Op::InstanceBeats(0)).await;
+        let refused = |lasts_ms| {
+            let demand = world.demand(abilities.clone(), Some(lasts_ms));
+            let stage = demand.stages.first().expect("tasks wait").clone();
+            stage.refused.is_some()
+        };
+        assert_eq!(
+            (refused(400), refused(600), refused(700)),
+            (true, true, false)
+        );
         world.close().await;
     });
 }

@@ -109,18 +109,7 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
             }
         ),
         "ListWorkers" => code!(list_workers, wire::ListWorkersRequest {}),
-        "GetDemand" => code!(
-            get_demand,
-            wire::GetDemandRequest {
-                worker: Some(wire::Hello {
-                    worker_id: uuid::Uuid::new_v4().to_string(),
-                    incarnation: uuid::Uuid::new_v4().to_string(),
-                    name: "pool".into(),
-                    version: "1".into(),
-                    ..Default::default()
-                })
-            }
-        ),
+        "GetDemand" => code!(get_demand, pool("r1")),
         "DrainWorker" => code!(
             drain_worker,
             wire::DrainWorkerRequest {
@@ -129,6 +118,21 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
         ),
         "ListAudit" => code!(list_audit, wire::ListAuditRequest::default()),
         other => panic!("{other} is new: say here who may call it"),
+    }
+}
+
+/// Returns the question of a pool of workers with this version of the renderer.
+fn pool(renderer: &str) -> wire::GetDemandRequest {
+    wire::GetDemandRequest {
+        worker: Some(wire::Hello {
+            worker_id: uuid::Uuid::new_v4().to_string(),
+            incarnation: uuid::Uuid::new_v4().to_string(),
+            name: "pool".into(),
+            version: "1".into(),
+            cores: 1,
+            kinds: [("render".to_owned(), renderer.to_owned())].into(),
+            ..Default::default()
+        }),
     }
 }
 
@@ -247,6 +251,54 @@ async fn lists_and_equal_jobs_show_nobody_what_they_may_not_see() {
                     let equal = farm.submit(who, &of_lidar, false).await.unwrap();
                     assert_eq!(equal.job == job, standing.shares, "{who} {visibility}");
                 }
+            }
+            farm.stop().await;
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_pool_learns_how_much_waits_but_not_for_whom_it_may_not_see() {
+    for visibility in Visibility::ALL {
+        let folder = tempfile::tempdir().unwrap();
+        for catalog in catalogs(&folder).await {
+            let farm = Farm::start(catalog, visibility).await;
+            let of_lidar = spec("shared", r#""project": "lidar","#);
+            let job = farm.submit("ada", &of_lidar, false).await.unwrap().job;
+            for standing in standings(visibility) {
+                let Standing { who, role, .. } = standing;
+                if role == Role::Work {
+                    continue;
+                }
+                let mut jobs = farm.jobs(who);
+                let demand = loop {
+                    let demand = jobs.get_demand(pool("r1")).await.unwrap().into_inner();
+                    if !demand.unknown {
+                        break demand;
+                    }
+                    again_soon().await;
+                };
+                let stages = demand
+                    .stages
+                    .iter()
+                    .map(|s| (&*s.job_id, &*s.stage, s.tasks));
+                let (id, stage) = match standing.sees {
+                    true => (&*job, "render"),
+                    false => ("", ""),
+                };
+                assert_eq!(
+                    stages.collect::<Vec<_>>(),
+                    [(id, stage, 2)],
+                    "{who} {visibility}"
+                );
+                let other = jobs.get_demand(pool("r2")).await.unwrap().into_inner();
+                let why: Vec<_> = other.stages.iter().map(|s| &*s.refused).collect();
+                assert_eq!(
+                    why.len(),
+                    usize::from(standing.sees),
+                    "{who} {visibility}: {why:?}"
+                );
+                assert!(why.iter().all(|w| w.contains("renderer \"r1\"")), "{why:?}");
             }
             farm.stop().await;
         }

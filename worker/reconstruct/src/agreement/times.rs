@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use super::{FEWEST_SPOTS, FEWEST_TIMES, median, sample};
+use super::{FEWEST_SPOTS, FEWEST_TIMES, OFFSET, median, sample};
 use crate::Measured;
 
 /// The least share of lit pixels for judging a single spot.
@@ -11,8 +11,6 @@ const LEAST_LIT: f32 = 0.15;
 const FAR_M: f32 = 0.3;
 /// The rows and columns of the parts of the image whose offsets are compared.
 const PARTS: usize = 2;
-/// The least share of the mean offset that the median of every part must have.
-const SHARED: f32 = 0.5;
 /// The least weight of a pixel's own offset: the sum of squares of what a change of depth cannot
 /// explain. Less than this tells no offset.
 const LEAST_WEIGHT: f64 = 0.05;
@@ -24,9 +22,9 @@ pub(crate) struct Times {
     pub pairs: usize,
     /// The median of the absolute residuals, metres.
     pub residual_m: f32,
-    /// The mean offset of times beyond geometry, metres: positive if they are late, 0 if it is not
-    /// that of every part of the image. A shifted clock moves all times; light of
-    /// three bounces and wrong walls move those of some parts.
+    /// The mean offset of times beyond geometry, metres: positive if they are late, 0 if the median
+    /// of a part of the image is below the limit. A shifted clock moves all times; light of three
+    /// bounces and wrong walls move those of some parts.
     pub offset_m: f32,
     /// Each spot's median of its absolute residuals, metres; NaN if it has none.
     pub by_spot_m: Vec<f32>,
@@ -89,7 +87,7 @@ pub(crate) fn times(measured: &Measured, range: &[f32]) -> Times {
     Times {
         pairs: all.len(),
         residual_m: median(&mut all),
-        offset_m: shared_offset(parts),
+        offset_m: shared_offset(parts, OFFSET.doubtful(measured.bin_width_m)),
         by_spot_m: by_spot
             .iter_mut()
             .zip(used)
@@ -111,9 +109,9 @@ fn part(measured: &Measured, pixel: usize) -> usize {
 }
 
 /// Returns the mean offset, from the offset of each pixel and its weight in the whole image and in
-/// its parts; 0 if the median of one part has another sign or much less, NaN without any pixel.
-/// Parts with few pixels do not count.
-fn shared_offset(parts: [Vec<(f32, f32)>; 1 + PARTS * PARTS]) -> f32 {
+/// its parts; 0 if the median of one part has another sign or is below `least`, NaN without any
+/// pixel. Parts with few pixels do not count.
+fn shared_offset(parts: [Vec<(f32, f32)>; 1 + PARTS * PARTS], least: f32) -> f32 {
     let [whole, parts @ ..] = parts;
     let weight = |own: &[(f32, f32)]| own.iter().map(|o| f64::from(o.1)).sum::<f64>();
     let sum: f64 = whole.iter().map(|o| f64::from(o.0) * f64::from(o.1)).sum();
@@ -129,7 +127,7 @@ fn shared_offset(parts: [Vec<(f32, f32)>; 1 + PARTS * PARTS]) -> f32 {
             sum += f64::from(o.1);
             sum >= half
         });
-        middle.is_some_and(|o| o.0 * mean > 0.0 && o.0.abs() >= SHARED * mean.abs())
+        middle.is_some_and(|o| o.0 * mean > 0.0 && o.0.abs() >= least)
     };
     match mean.is_nan() || parts.into_iter().all(shared) {
         true => mean,

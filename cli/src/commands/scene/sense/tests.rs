@@ -17,6 +17,7 @@ fn args(folder: &Path, out: &str) -> SceneSense {
             rebin: Some(4),
             ..SensorArgs::default()
         },
+        on_counts: false,
         seed: 7,
         scene: 0,
         threads: Some(1),
@@ -29,12 +30,17 @@ fn measure(args: &SceneSense) -> Result<Report> {
 
 /// A render of 3×2 pixels and 50 bins of 8 ps, as `scene render --split` writes it.
 fn rendered(folder: &Path) {
+    rendered_in(folder, 0.01);
+}
+
+/// The same with another unit of light.
+fn rendered_in(folder: &Path, unit: f32) {
     let shape = [3u64, 2, 50];
     let two: Vec<f32> = (0..300)
-        .map(|i| if i % 50 == 20 { 0.01 } else { 0.0 })
+        .map(|i| if i % 50 == 20 { unit } else { 0.0 })
         .collect();
     let mut transient = two.clone();
-    transient[5] = 0.05;
+    transient[5] = 5.0 * unit;
     let spec = DatasetSpec {
         scenes: 1,
         height: 3,
@@ -97,6 +103,25 @@ fn rendered(folder: &Path) {
     let encode = |dataset: &Dataset| dataset.encode(0, &record, &provenance);
     let dir = folder.join("render");
     block_on(write_single_render(&dir, &spec, encode, &parts)).unwrap();
+}
+
+#[test]
+fn photon_counts_get_noise_only_when_asked_and_say_so() {
+    let folder = tempfile::tempdir().unwrap();
+    rendered_in(folder.path(), 1.0);
+    let mut args = args(folder.path(), "again");
+    let Err(refused) = measure(&args) else {
+        panic!("photon counts");
+    };
+    assert!(
+        refused.message.contains("photon counts"),
+        "{}",
+        refused.message
+    );
+    assert!(refused.hint.unwrap().contains("--on-counts"));
+    args.on_counts = true;
+    let made = measure(&args).unwrap_or_else(|e| panic!("{}", e.message));
+    assert!(made.text.contains("photon counts"), "{}", made.text);
 }
 
 #[test]
