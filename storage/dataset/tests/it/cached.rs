@@ -39,8 +39,8 @@ async fn what_was_read_once_needs_only_the_manifest_again() {
         let spec = spec(profile);
         let (store, data) = in_memory(&spec).await;
         let record = Scene::new(&spec, 1);
-        let publish = data.publish(1, &record.record(), &provenance());
-        let manifest = publish.await.unwrap();
+        let (scene, made) = (record.record(), provenance());
+        let manifest = data.publish(1, &scene, &made).await.unwrap();
         let data = data.with_cache(Cache::open(folder.path(), 1 << 30).unwrap());
         let first = read_all(&data).await;
         for object in &manifest.objects {
@@ -62,8 +62,8 @@ async fn damaged_entries_are_read_from_the_store() {
     let spec = spec(PROFILES[0]);
     let (_, data) = in_memory(&spec).await;
     let record = Scene::new(&spec, 1);
-    let publish = data.publish(1, &record.record(), &provenance());
-    publish.await.unwrap();
+    let (scene, made) = (record.record(), provenance());
+    data.publish(1, &scene, &made).await.unwrap();
     let data = data.with_cache(Cache::open(folder.path(), 1 << 30).unwrap());
     let first = read_all(&data).await;
     for (k, file) in entries(folder.path()).into_iter().enumerate() {
@@ -87,8 +87,8 @@ async fn a_scene_that_was_replaced_is_read_from_the_store() {
     for seed in [1, 2] {
         let (_, data) = in_memory(&spec).await;
         let record = Scene::new(&spec, seed);
-        let publish = data.publish(1, &record.record(), &provenance());
-        publish.await.unwrap();
+        let (scene, made) = (record.record(), provenance());
+        data.publish(1, &scene, &made).await.unwrap();
         let plain = read_all(&data).await;
         let data = data.with_cache(Cache::open(folder.path(), 1 << 30).unwrap());
         assert_eq!(read_all(&data).await, plain);
@@ -103,8 +103,8 @@ async fn damage_of_the_store_does_not_stay_in_the_cache() {
     let spec = spec(PROFILES[0]);
     let (store, data) = in_memory(&spec).await;
     let record = Scene::new(&spec, 1);
-    let publish = data.publish(1, &record.record(), &provenance());
-    let manifest = publish.await.unwrap();
+    let (scene, made) = (record.record(), provenance());
+    let manifest = data.publish(1, &scene, &made).await.unwrap();
     let first = read_all(&data).await;
     let data = data.with_cache(Cache::open(folder.path(), 1 << 30).unwrap());
     let shard = manifest
