@@ -137,7 +137,7 @@ def simulate(scene, data, args):
         scan(folder, u, v)
         # What the files do not say, for `picofarm capture import`.
         described = {
-            "gate": {"t0_ps": T0_S * 1e12, "bin_width_ps": BIN_S * 1e12, "keep_m": scene.gate},
+            "gate": {"t0_ps": T0_S * 1e12, "bin_width_ps": BIN_S * 1e12, "keep_m": scene.gate, "bins": bins},
             "frame": ["left", "up", "forward"],
             "laser_m": [scenes.BASELINE_M, 0.0, 0.0],
         }

@@ -13,7 +13,8 @@ use crate::{
     sweep::quiet,
 };
 
-/// Path before and after the arrival of a spot's own return in which its pulse is looked for, metres.
+/// Path before and after the arrival of a spot's own return in which its pulse is looked for,
+/// metres.
 const BEFORE_M: f64 = 0.25;
 const AFTER_M: f64 = 1.2;
 /// Difference between calibrated and seen arrival of a return at most, metres.
@@ -36,8 +37,8 @@ pub struct Pulse {
 }
 
 impl Pulse {
-    /// Returns the pulse that the spots' own one-bounce returns show, in bins of the capture; `None`
-    /// if no return is seen.
+    /// Returns the pulse that the spots' own one-bounce returns show, in bins of the capture, or
+    /// `None` if no return is seen.
     pub fn of_returns(capture: &Capture, rays: &Rays, sources: &[Source]) -> Option<Self> {
         let (gate, bins) = (&capture.gate, capture.gate.bins as usize);
         let width = gate.bin_width_m;
@@ -123,8 +124,9 @@ impl Pulse {
         self.values[near].iter().sum::<f32>() >= NARROW
     }
 
-    /// Histograms without the pulse: the light of each bin that makes the counts most likely if they
-    /// are Poisson (Richardson 1972, Lucy 1974), with the ambient light of the first `quiet` bins.
+    /// Returns histograms without the pulse: the light of each bin that makes the counts most
+    /// likely if they are Poisson (Richardson 1972, Lucy 1974), with the ambient light of the first
+    /// `quiet` bins.
     pub fn remove(&self, histogram: &[f32], gate: &Gate, quiet: usize) -> Vec<f32> {
         let bins = gate.bins as usize;
         let mut out = vec![0.0; histogram.len()];
