@@ -38,9 +38,9 @@ impl Core {
         runs
     }
 
-    /// Settles a task, which a worker finished for the stage `by`, in the other stages that want the
-    /// same output and have claimed the task. Without this, jobs that take turns over one data set
-    /// would each run all of it.
+    /// Settles a task, which a worker finished for the stage `by`, in the other stages that want
+    /// the same output and have claimed the task. Without this, jobs that take turns over one data
+    /// set would each run all of it.
     pub(super) fn settle_for_others(&mut self, by: StageRef, task: u64, now_ms: i64) {
         let sharing = self.stages.sharing(&self.stages[&by]);
         if sharing.len() < 2 {

@@ -31,8 +31,8 @@ use args::{Command, Lab};
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    // The benchmarks of the scheduler, of small tasks, of pages and of storage start this program again in these
-    // roles.
+    // The benchmarks of the scheduler, of small tasks, of pages and of storage start this program
+    // again in these roles.
     let role = std::env::args().nth(1);
     if matches!(
         role.as_deref(),

@@ -1,14 +1,14 @@
 //! The depths that a camera sees in a room that is a box, without a ray for each pixel.
 //!
-//! The acceptance of a generated room needs the smallest and the largest z-depth over the centres of
-//! 65,536 pixels. Rectangles of pixels are halved, and one is left out when bounds show that it has
-//! neither. A ray decides each remaining pixel, so the result has the same bits as
+//! The acceptance of a generated room needs the smallest and the largest z-depth over the centres
+//! of 65,536 pixels. Rectangles of pixels are halved, and one is left out when bounds show that it
+//! has neither. A ray decides each remaining pixel, so the result has the same bits as
 //! [`full_view`](crate::view::full_view).
 //!
-//! Along a ray, the inverse distance to a wall's plane is linear in the position on the film, so its
-//! extremes over a rectangle are at the corners. A ray leaves the box at the nearest of the planes
-//! ahead. An object is at least as far as the planes of its bounding box that face the camera, and as
-//! the nearest corner of that box.
+//! Along a ray, the inverse distance to a wall's plane is linear in the position on the film, so
+//! its extremes over a rectangle are at the corners. A ray leaves the box at the nearest of the
+//! planes ahead. An object is at least as far as the planes of its bounding box that face the
+//! camera, and as the nearest corner of that box.
 
 use crate::{Camera, Vec3, trace::World};
 
@@ -90,8 +90,8 @@ enum Search {
 }
 
 /// Returns the smallest and largest z-depth over every pixel centre, or `None` if one is outside
-/// `bounds`. The camera is within a box with opaque walls from `room[0]` to `room[1]`, which are the
-/// first `walls` models of `world`.
+/// `bounds`. The camera is within a box with opaque walls from `room[0]` to `room[1]`, which are
+/// the first `walls` models of `world`.
 pub(crate) fn depths_in_box(
     (world, walls): (&World, usize),
     room: [Vec3; 2],
@@ -163,7 +163,8 @@ impl BoxView<'_> {
         Some(())
     }
 
-    /// Returns a lower bound of the smallest depth in a rectangle, or an upper bound of the largest.
+    /// Returns a lower bound of the smallest depth in a rectangle, or an upper bound of the
+    /// largest.
     fn bound(&self, pixels: Pixels, search: Search) -> f64 {
         let corners = pixels.corners();
         // The smallest and largest components of the rays, which are linear on the film.

@@ -151,8 +151,9 @@ impl Assignments {
         true
     }
 
-    /// Handles a revoked lease. Returns `true` if running tasks belong to it and must stop. This is the case only if the lease was still live, because then its work is not wanted. A
-    /// lease that had already expired is merely lost.
+    /// Handles a revoked lease. Returns `true` if running tasks belong to it and must stop. This is
+    /// the case only if the lease was still live, because then its work is not wanted. A lease that
+    /// had already expired is merely lost.
     pub(crate) fn revoked(&mut self, now: Instant, lease: LeaseRef) -> bool {
         let live = self
             .leases

@@ -1,6 +1,6 @@
-//! The lanes on which tasks run. A task that uses all threads of the worker runs alone, in the first
-//! lane. Several small tasks of one stage run at the same time, each in a lane with threads of its
-//! own, because one of them cannot use all threads, and waits for its store in between.
+//! The lanes on which tasks run. A task that uses all threads of the worker runs alone, in the
+//! first lane. Several small tasks of one stage run at the same time, each in a lane with threads
+//! of its own, because one of them cannot use all threads, and waits for its store in between.
 
 use std::{future::poll_fn, sync::Arc, task::Poll};
 
@@ -105,8 +105,8 @@ impl Lanes {
         Ok(())
     }
 
-    /// Waits for the end of a running task. Returns its lease, its index, its last log lines and its
-    /// result. Cancel-safe; it never returns while no task is running.
+    /// Waits for the end of a running task. Returns its lease, its index, its last log lines and
+    /// its result. Cancel-safe; it never returns while no task is running.
     pub(crate) async fn finished(
         &mut self,
     ) -> (LeaseRef, u64, Vec<TaskLine>, Result<Output, TaskError>) {

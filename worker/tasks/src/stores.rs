@@ -65,8 +65,8 @@ pub(crate) struct Stores {
     /// Folders that passed the check of their contents: empty, or only with names of the kind that
     /// writes there.
     own_folders: Mutex<BTreeSet<String>>,
-    /// The data set that was last opened for writing, so that tasks of the same stage need not parse
-    /// its metadata again.
+    /// The data set that was last opened for writing, so that tasks of the same stage need not
+    /// parse its metadata again.
     last: Mutex<Option<LastDataset>>,
     /// Opened stores that are only read, by location.
     sources: Mutex<BTreeMap<StoreName, StorePath>>,
