@@ -73,10 +73,18 @@ fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<
 /// cannot be opened.
 pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
     let mut spec = read_uncounted(path, scale, asset_dir)?;
-    for stage in &mut spec.stages {
+    for i in 0..spec.stages.len() {
+        let (before, rest) = spec.stages.split_at_mut(i);
+        let stage = &mut rest[0];
         if let Some((source, count)) = stage.task.reads_mut()
             && *count == 0
         {
+            // A data set that the job makes has the scenes of its source, counted before.
+            let place = (&source.store, &source.dataset);
+            if let Some(maker) = before.iter().find(|s| s.task.writes() == Some(place)) {
+                *count = maker.tasks();
+                continue;
+            }
             let failed = |e: picofarm_store::StorageError| {
                 CliError::input(format!(
                     "{}: stage {:?}: source: {e}",

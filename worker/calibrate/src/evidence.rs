@@ -108,7 +108,7 @@ pub(crate) fn lacking(f: &Findings) -> Option<Failed> {
         value: f.evidence.times as f64,
         error: 0.0,
         unit: "times",
-        finding: format!("cannot tell whether the calibration is right: {finding}"),
+        finding,
         advice,
         corrected: false,
     };

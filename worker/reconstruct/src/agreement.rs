@@ -51,8 +51,8 @@ pub struct Agreement {
     pub time_residual_m: Option<f32>,
     /// The spot with the largest such median, and that median.
     pub worst_spot: Option<(usize, f32)>,
-    /// The mean offset of times beyond geometry, metres of path; 0 if not every part of the image is
-    /// off by the limit, as with a shifted clock.
+    /// The mean offset of times beyond geometry, metres of path; 0 unless every part of the image
+    /// is off by the limit, as with a shifted clock.
     pub time_offset_m: Option<f32>,
     /// The median distance of spots from the visible surfaces around them, metres.
     pub spots_off_surface_m: Option<f32>,

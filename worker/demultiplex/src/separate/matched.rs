@@ -19,6 +19,9 @@ const THRESHOLD_LOG10: f32 = -2.5;
 /// Correlation with itself of a pulse of 128 ps, as density for a bin of 8 ps: the published
 /// threshold is a share of 6 % of it.
 const OWN_PUBLISHED: f32 = 0.05;
+/// The most by which a narrow pulse raises the threshold: the width of a pixel spreads its light
+/// over centimetres of path, whatever the pulse.
+const MOST_NARROW: f32 = 8.0;
 /// Share of the peak at which the pulse ends on both sides.
 const END: f32 = 0.01;
 
@@ -71,7 +74,7 @@ pub fn returns(histogram: &[f32], timing: &Timing, out: &mut [Return]) {
     let bins = timing.gate.bins as usize;
     let pulse = Pulse::new(histogram, timing);
     let density = (UNIT_M / timing.gate.bin_width_m) as f32;
-    let narrower = (density * pulse.own / OWN_PUBLISHED).max(1.0);
+    let narrower = (density * pulse.own / OWN_PUBLISHED).clamp(1.0, MOST_NARROW);
     out.par_iter_mut()
         .zip(histogram.par_chunks(bins))
         .for_each(|(found, h)| {

@@ -117,27 +117,30 @@ fn depth_is_right_to_millimetres_and_masks_are_the_true_ones() {
 
 #[test]
 fn without_a_pulse_later_bounces_light_nothing_for_the_matched_filter() {
-    let (room, blurred) = rooms(false);
-    let (bins, laser) = (GATE.bins as usize, Vec3::new(0.08, 0.0, 0.0));
-    let captures: Vec<Vec<f32>> = grid(3)
-        .iter()
-        .zip(&blurred)
-        .map(|(place, blurred)| {
-            let spot = std::slice::from_ref(place);
-            let lit = |_: usize, _: usize| true;
-            let sharp = Room::shaped(SIDE, spot, Some(plate()), GATE, laser, SHAPE, lit).histogram;
-            // Every pixel sees light of three and more bounces, over 150 bins.
-            let mut all: Vec<f32> = sharp.iter().map(|x| PHOTONS * x).collect();
-            let mut usual: Vec<f32> = blurred.chunks(bins).map(|h| h.iter().sum()).collect();
-            usual.sort_by(f32::total_cmp);
-            let usual = usual[usual.len() / 2];
-            for h in all.chunks_mut(bins) {
-                let later = h.iter_mut().skip(600).take(150);
-                later.for_each(|x| *x += 0.3 * usual / 150.0);
-            }
-            all
-        })
-        .collect();
+    let laser = Vec3::new(0.08, 0.0, 0.0);
+    let gate = Gate {
+        bin_width_m: 0.006,
+        bins: 540,
+        ..GATE
+    };
+    let room = |places: &[[f32; 2]]| {
+        Room::shaped(SIDE, places, Some(plate()), gate, laser, SHAPE, |_, _| true)
+    };
+    let capture = |place: &[f32; 2]| {
+        let mut all = room(std::slice::from_ref(place)).histogram;
+        let bins = gate.bins as usize;
+        let mut usual: Vec<f32> = all.chunks(bins).map(|h| h.iter().sum()).collect();
+        usual.sort_by(f32::total_cmp);
+        let usual = usual[usual.len() / 2];
+        // Every pixel sees light of three and more bounces, over 60 bins.
+        for h in all.chunks_mut(bins) {
+            let later = h.iter_mut().skip(240).take(60);
+            later.for_each(|x| *x += 0.3 * usual / 60.0);
+        }
+        all
+    };
+    let captures: Vec<Vec<f32>> = grid(3).iter().map(capture).collect();
+    let room = room(&grid(3));
     let found = found(&room, &captures, Separate::MatchedFilter, true);
     let (depth, masks) = errors(&room, &found);
     assert!(depth < 0.006, "{depth} m");
