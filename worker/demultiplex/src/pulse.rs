@@ -105,7 +105,7 @@ impl Pulse {
 
     /// The pulse in bins of `per` of its own, of light that arrives anywhere in one of them.
     pub fn summed(&self, per: usize) -> Self {
-        let zero = (self.zero + per - 1) / per;
+        let zero = self.zero.div_ceil(per);
         let count = zero + (self.values.len() - self.zero + per - 1).div_ceil(per) + 1;
         let mut values = vec![0.0; count];
         for a in 0..per {
