@@ -6,7 +6,6 @@ mod limits;
 pub mod pages;
 mod raw;
 mod server;
-pub mod small;
 mod stats;
 mod worker;
 
