@@ -107,10 +107,10 @@ output = {{ store = {store:?}, dataset = "room-3d" }}
     let ended = farm.until_ended(id["job"].as_str().unwrap());
     assert_eq!(ended["state"], "done", "{ended}");
 
-    let manifest = json_of(&store.join("right/manifests/000000.json"));
+    let manifest = json_of(&store.join("right/manifests/0.json"));
     let plan = &manifest["provenance"]["plan"];
     assert_eq!(plan["kind"], "calibrate");
-    let source = fs::read(lab.join("manifests/000000.json")).unwrap();
+    let source = fs::read(lab.join("manifests/0.json")).unwrap();
     let named = hex::encode(Sha256::digest(&source));
     assert_eq!(plan["source"]["manifest_sha256"], named);
     let causes = plan["report"]["causes"].as_array().unwrap();
