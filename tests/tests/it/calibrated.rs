@@ -126,7 +126,5 @@ output = {{ store = {store:?}, dataset = "room-3d" }}
     let metrics = json_of(&store.join("room-3d/scenes/0/metrics.json"));
     assert!(metrics["agreement"].is_object(), "{metrics}");
     // Histograms of each spot stay.
-    let again = cli.json(&["capture", "check", lab.to_str().unwrap()]);
-    assert_eq!(again["verdict"], "usable", "{again}");
     assert!(store.join("right/transient_spots").is_dir());
 }
