@@ -3,38 +3,16 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use picofarm_proto::{
-    ids::{JobId, StageRef, WorkerId},
-    messages::Abilities,
-};
+use picofarm_proto::ids::{JobId, StageRef, WorkerId};
 use uuid::Uuid;
 
 use super::{
-    pools::PoolFit, stage_entry::StageEntry, state::Core, store_faults::store_of, words::span,
+    pools::{PoolFit, Shape},
+    stage_entry::StageEntry,
+    state::Core,
+    store_faults::store_of,
+    words::span,
 };
-
-/// The workers that a program can start.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Shape {
-    /// Name of the pool. The names of its workers begin with it and a hyphen.
-    pub pool: String,
-    /// What each worker has.
-    pub abilities: Abilities,
-    /// How long each worker may run, milliseconds; `None` without a limit.
-    pub lasts_ms: Option<u64>,
-}
-
-impl Shape {
-    /// Returns the pool with regard to a stage that it refuses for this reason, or does not refuse.
-    pub(super) fn fit(&self, refused: Option<String>) -> PoolFit {
-        PoolFit {
-            name: self.pool.clone(),
-            refused,
-            cores: self.abilities.cores,
-            lasts_ms: self.lasts_ms,
-        }
-    }
-}
 
 /// The work that waits for workers of a shape.
 #[derive(Debug, Clone, PartialEq, Default)]

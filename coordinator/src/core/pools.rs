@@ -3,12 +3,35 @@
 
 use std::collections::BTreeMap;
 
-use super::demand::Shape;
+use picofarm_proto::messages::Abilities;
 
 /// A pool is forgotten this long after its program has last asked.
 const FORGOTTEN_MS: i64 = 600_000;
 /// Most pools that are remembered.
 const MOST: usize = 64;
+
+/// The workers that a program can start.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Shape {
+    /// Name of the pool. The names of its workers begin with it and a hyphen.
+    pub pool: String,
+    /// What each worker has.
+    pub abilities: Abilities,
+    /// How long each worker may run, milliseconds; `None` without a limit.
+    pub lasts_ms: Option<u64>,
+}
+
+impl Shape {
+    /// Returns the pool with regard to a stage that it refuses for this reason, or does not refuse.
+    pub(super) fn fit(&self, refused: Option<String>) -> PoolFit {
+        PoolFit {
+            name: self.pool.clone(),
+            refused,
+            cores: self.abilities.cores,
+            lasts_ms: self.lasts_ms,
+        }
+    }
+}
 
 /// The pools that have asked lately, by name.
 #[derive(Default)]
