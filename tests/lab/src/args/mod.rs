@@ -33,6 +33,9 @@ pub enum Command {
     /// Measure the pages of `picofarm web` at many jobs and workers, and the coordinator's CPU with
     /// many viewers
     Pages(Pages),
+    /// Measure the CPU of real tasks that take next to no time: scenes of one pixel, with
+    /// coordinator and workers on this machine
+    Small(Small),
     /// Measure the cost of very many (simulated, tiny) scenes: list, verify, snapshot, gc
     Dataset(Dataset),
     /// Measure storage on scenes of this renderer: size, error and speed of all profiles, and of
@@ -200,6 +203,20 @@ pub struct Pages {
     /// Requests of each page
     #[arg(long, default_value_t = 100)]
     pub asks: usize,
+}
+
+#[derive(Args)]
+pub struct Small {
+    /// Workers
+    #[arg(long, default_value_t = 2, value_parser = ranges::workers)]
+    pub workers: usize,
+    /// Scenes of one pixel
+    #[arg(long, default_value_t = 2_000, value_parser = clap::value_parser!(u64).range(1..))]
+    pub tasks: u64,
+    /// Folder for the store and the catalog, on the disk to be measured [default: the system's
+    /// temporary folder]
+    #[arg(long, value_name = "DIR")]
+    pub dir: Option<PathBuf>,
 }
 
 #[derive(Args)]

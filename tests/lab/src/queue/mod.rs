@@ -6,6 +6,7 @@ mod limits;
 pub mod pages;
 mod raw;
 mod server;
+pub mod small;
 mod stats;
 mod worker;
 
