@@ -4,8 +4,8 @@
 //! Three steps differ: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin
 //! late), pixels near a spot are not used (PlatoNeRF sets their histograms to zero, which then
 //! count as shadow), and a pulse wider than three bins counts as one return (PlatoNeRF's bins are
-//! as wide as its pulse). [`Captures::finish`] continues from there and compares each pixel's two-bounce
-//! light with the expected light of a lit pixel; [`Captures::finish_plain`] does not.
+//! as wide as its pulse). [`Captures::finish`] continues from there and compares each pixel's
+//! two-bounce light with the expected light of a lit pixel; [`Captures::finish_plain`] does not.
 
 use picofarm_scene::{Beam, Camera, Laser, Vec3};
 use picofarm_settings::Sensor;
