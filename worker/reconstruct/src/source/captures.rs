@@ -290,6 +290,8 @@ struct Pulse<'a> {
     peak: usize,
     /// Its width at half of the peak, bins.
     width: usize,
+    /// The part of `whole` that is at least half as high as the peak.
+    core: std::ops::Range<usize>,
     /// The greatest response of a histogram that is the pulse alone; 1 for a narrow one, because
     /// the threshold refers to it.
     own: f32,
@@ -297,15 +299,17 @@ struct Pulse<'a> {
 
 impl<'a> Pulse<'a> {
     fn new(template: &'a [f32]) -> Self {
-        let above = |&(_, v): &(usize, f32)| v >= TEMPLATE_FLOOR;
+        let (peak, most) = peak(template);
+        let floor = TEMPLATE_FLOOR.min(0.5 * most);
+        let above = |&(_, v): &(usize, f32)| v >= floor;
         let taps: Vec<(usize, f32)> =
             (template.iter().copied().enumerate().filter(above)).collect();
         let first = taps.first().map_or(0, |t| t.0);
         let last = taps.last().map_or(0, |t| t.0);
-        let (peak, most) = peak(template);
         let high = |v: &&f32| **v >= 0.5 * most;
-        let width = template[..peak].iter().rev().take_while(high).count()
-            + template[peak..].iter().take_while(high).count();
+        let before = template[..peak].iter().rev().take_while(high).count();
+        let width = before + template[peak..].iter().take_while(high).count();
+        let core = peak - before - first..peak - before - first + width;
         let own = match width > NARROW {
             true => taps.iter().map(|(_, v)| v * v).sum(),
             false => 1.0,
@@ -316,6 +320,7 @@ impl<'a> Pulse<'a> {
             first,
             peak,
             width,
+            core,
             own,
         }
     }
@@ -333,7 +338,7 @@ impl<'a> Pulse<'a> {
     }
 
     /// Returns the bin of the strongest return and the greatest response of the matched filter. A
-    /// narrow return is the highest bin. A wide one is where the response is greatest.
+    /// narrow return is the highest bin. A wide one is where the core of the pulse fits best.
     fn response(&self, h: &[f32]) -> (usize, f32) {
         let bins = h.len();
         if !self.is_wide() {
@@ -347,18 +352,27 @@ impl<'a> Pulse<'a> {
             }
             return (peak(h).0, response);
         }
+        // The time follows from the core of the pulse, because light of three bounces arrives in
+        // its tail.
         let before = self.peak - self.first;
-        let mut best = (0, 0.0f32);
+        let (mut at, mut most, mut response) = (0, 0.0f32, 0.0f32);
         for bin in 0..bins {
-            let whole = &self.whole[before.saturating_sub(bin)..];
             let light = &h[bin.saturating_sub(before)..];
-            let c: f32 = whole.iter().zip(light).map(|(v, h)| v * h).sum();
-            if c > best.1 {
-                best = (bin, c);
+            let whole = &self.whole[before.saturating_sub(bin)..];
+            response = response.max(product(whole, light));
+            let core = &self.whole[self.core.start.max(before.saturating_sub(bin))..self.core.end];
+            let first = (bin + self.core.start).saturating_sub(before);
+            let near = product(core, h.get(first..).unwrap_or(&[]));
+            if near > most {
+                (at, most) = (bin, near);
             }
         }
-        best
+        (at, response)
     }
+}
+
+fn product(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Returns the bin by which a small share of a histogram's light has arrived, or `None` without
