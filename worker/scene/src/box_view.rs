@@ -103,13 +103,12 @@ pub(crate) fn depths_in_box(
     let [cx, cy, fx, fy] = [i.cx, i.cy, i.fx, i.fy].map(f64::from);
     let axes = [camera.right, camera.down, camera.forward];
     let along = |k: usize| axes.map(|axis| f64::from(axis[k]));
-    let mut ray = [[0.0; 3]; 3];
-    for k in 0..3 {
+    let columns = [0, 1, 2].map(|k| {
         let [right, down, forward] = along(k);
-        ray[0][k] = forward - right * cx / fx - down * cy / fy;
-        ray[1][k] = right / fx;
-        ray[2][k] = down / fy;
-    }
+        let middle = forward - right * cx / fx - down * cy / fy;
+        [middle, right / fx, down / fy]
+    });
+    let ray = [0, 1, 2].map(|part| columns.map(|column| column[part]));
     let mut view = BoxView {
         world,
         camera,
@@ -246,9 +245,9 @@ fn cover(camera: &Camera, corners: [Vec3; 2]) -> Cover {
             x / z * f64::from(i.fx) + f64::from(i.cx),
             y / z * f64::from(i.fy) + f64::from(i.cy),
         ];
-        for k in 0..2 {
-            cover.lo[k] = cover.lo[k].min(place[k]);
-            cover.hi[k] = cover.hi[k].max(place[k]);
+        for (k, at) in place.into_iter().enumerate() {
+            cover.lo[k] = cover.lo[k].min(at);
+            cover.hi[k] = cover.hi[k].max(at);
         }
     }
     cover
