@@ -181,7 +181,7 @@ fn a_bounce_flash_collection_keeps_its_spots_apart() {
     assert!(said.contains("t0"), "{said}");
     let text = r#"{"gate": {"t0_ps": 14242.8}, "frame": ["left", "up", "forward"], "laser_m": [0.257, 0, 0]}"#;
     std::fs::write(collection.join("capture.json"), text).unwrap();
-    let capture = import(&[collection], None, &Opener::anywhere()).unwrap();
+    let capture = import(std::slice::from_ref(&collection), None, &Opener::anywhere()).unwrap();
     assert_eq!((capture.beams.len(), capture.gate.bins), (2, 1502));
     assert_eq!(capture.laser, [-0.257, 0.0, 0.0]);
     let sum: Vec<f32> = std::iter::zip(capture.spot(0).unwrap(), capture.spot(1).unwrap())
@@ -189,4 +189,15 @@ fn a_bounce_flash_collection_keeps_its_spots_apart() {
         .collect();
     assert_eq!(capture.sum, sum);
     assert!(capture.depth.is_none());
+    // A kept range has both of its ends.
+    let keep = r#""t0_ps": 14242.8, "bin_width_ps": 8.0, "keep_m": [1.0, 2.2]"#;
+    let text = text.replace(r#""t0_ps": 14242.8"#, keep);
+    std::fs::write(collection.join("capture.json"), &text).unwrap();
+    let kept = import(std::slice::from_ref(&collection), None, &Opener::anywhere()).unwrap();
+    assert!((kept.gate.start_m - 1.0).abs() < kept.gate.bin_width_m);
+    assert!((kept.gate.end_m() - 2.2).abs() < 1.5 * kept.gate.bin_width_m);
+    let text = text.replace(r#", "bin_width_ps": 8.0"#, "");
+    std::fs::write(collection.join("capture.json"), text).unwrap();
+    let said = import(&[collection], None, &Opener::anywhere()).unwrap_err();
+    assert!(said.to_string().contains("gate.bin_width_ps"), "{said}");
 }

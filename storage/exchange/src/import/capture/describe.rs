@@ -324,10 +324,21 @@ impl Description {
     pub fn options(&self, described: &Described) -> Result<ImportOptions, ImportError> {
         let g = &self.gate;
         let metres = |m: Option<f64>, ps: Option<f64>| m.or_else(|| ps.map(|ps| ps * LIGHT_M_PS));
+        let bin_width_m = metres(g.bin_width_m, g.bin_width_ps);
+        let bins = match (g.keep_m, g.bins, bin_width_m) {
+            (Some([from, to]), None, Some(width)) if to > from && width > 0.0 => {
+                Some(libm::ceil((to - from) / width - 1e-6) as u32)
+            }
+            (Some([from, to]), None, _) => {
+                let what = "two increasing paths, with gate.bin_width_ps";
+                return Err(described.refused("gate.keep_m", what, format!("{from} to {to}")));
+            }
+            (_, bins, _) => bins,
+        };
         Ok(ImportOptions {
             gate_start_m: g.keep_m.map(|k| k[0]).or(g.start_m),
-            bin_width_m: metres(g.bin_width_m, g.bin_width_ps),
-            bins: g.bins,
+            bin_width_m,
+            bins,
             fov_deg: self.camera.as_ref().and_then(|c| c.fov_deg),
             laser_m: self.laser(described)?,
             t0_s: g.t0_ps.map(|t| t * 1e-12),
