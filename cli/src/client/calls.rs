@@ -123,8 +123,8 @@ impl Client {
         match (matching.next(), matching.next()) {
             (Some(job), None) => Ok(job.id),
             (Some(a), Some(b)) => Err(CliError::input(format!(
-                "{text:?} fits several jobs, e.g. {} and {}",
-                a.id, b.id
+                "{text:?} fits several jobs, e.g. {} ({}) and {} ({})",
+                a.number, a.id, b.number, b.id
             ))
             .hint("give the number of the job, or its id")),
             _ => Err(CliError::input(format!("no job {text:?}")).hint("see `picofarm job list`")),

@@ -213,7 +213,7 @@ impl Pool<'_> {
         let state = format!(
             "{:?} {:?}",
             (d.wanted, d.pending, d.running, d.unable, d.submit),
-            (&round.cancelled, &round.refused)
+            (&round.submitted, &round.cancelled, &round.refused)
         );
         if state != self.said || once {
             self.output.result(&round, || words(&round));
@@ -240,7 +240,7 @@ impl Pool<'_> {
         if !news.ended.is_empty() && self.args.idle > self.args.every {
             let pause = self.pause();
             self.output.warn(format!(
-                "warning: {} ended before a worker connected; the logs of the allocations may tell why; submits again in {}",
+                "warning: {} ended before a worker connected, or the list leaves it out; the logs of the allocations may tell why; submits again in {}",
                 news.ended.join(", "),
                 duration(pause.as_secs_f64())
             ));
@@ -270,6 +270,7 @@ impl Pool<'_> {
         for _ in 0..round.decision.submit {
             match self.scheduler.submit(&self.request).await {
                 Ok(id) => {
+                    self.fruitless.submitted(&id);
                     round.submitted.push(id);
                     self.pause_until = None;
                 }

@@ -12,6 +12,7 @@ use rcgen::{
     BasicConstraints, CertificateParams, CertifiedIssuer, DnType, ExtendedKeyUsagePurpose, IsCa,
     Issuer, KeyPair, KeyUsagePurpose, date_time_ymd,
 };
+use rustls::pki_types::{CertificateDer, pem::PemObject};
 use serde_json::json;
 
 use crate::{
@@ -33,6 +34,9 @@ const AUTHORITY: Duration = DAY.saturating_mul(3_650);
 /// Fails if a host is no name or address, or a file cannot be read or written. An authority is
 /// never replaced.
 pub fn run(args: &Certificates, output: Output) -> Result<()> {
+    for host in &args.hosts {
+        check_host(host)?;
+    }
     let folder = &args.folder;
     fs::create_dir_all(folder).map_err(|e| io(folder.display(), &e))?;
     let path = |name: &str| folder.join(name);
@@ -47,14 +51,17 @@ pub fn run(args: &Certificates, output: Output) -> Result<()> {
             let text = files::read_text(&path("ca.key"), KEY)?;
             let key = KeyPair::from_pem(&text);
             let key = key.map_err(|e| refused(&path("ca.key").display(), &e))?;
+            match path("ca.pem").exists() {
+                true => check_pair(&path("ca.pem"), &key)?,
+                // A run that was interrupted.
+                false => write_authority(&path("ca.pem"), &key)?,
+            }
             Issuer::new(authority()?, key)
         }
         false => {
             let key = KeyPair::generate().map_err(|e| refused(&"the authority's key", &e))?;
             write(&path("ca.key"), &key.serialize_pem(), 0o600)?;
-            let made = CertifiedIssuer::self_signed(authority()?, &key);
-            let made = made.map_err(|e| refused(&"the authority", &e))?;
-            write(&path("ca.pem"), &made.pem(), 0o644)?;
+            write_authority(&path("ca.pem"), &key)?;
             Issuer::new(authority()?, key)
         }
     };
@@ -87,6 +94,39 @@ pub fn run(args: &Certificates, output: Output) -> Result<()> {
         )
     });
     Ok(())
+}
+
+/// Checks that a host is a name or an address, without scheme and port.
+fn check_host(host: &str) -> Result<()> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '.' | '_' | '*');
+    let is_name = !host.is_empty() && host.len() <= 253 && host.chars().all(plain);
+    if is_name || host.parse::<std::net::IpAddr>().is_ok() {
+        return Ok(());
+    }
+    let what = format!("--host {host:?}: expected a name or an address, without scheme and port");
+    Err(CliError::input(what))
+}
+
+/// Writes the certificate of the authority with this key.
+fn write_authority(path: &Path, key: &KeyPair) -> Result<()> {
+    let made = CertifiedIssuer::self_signed(authority()?, key);
+    let made = made.map_err(|e| refused(&"the authority", &e))?;
+    write(path, &made.pem(), 0o644)
+}
+
+/// Checks that a certificate is of a key: it contains the public key.
+fn check_pair(path: &Path, key: &KeyPair) -> Result<()> {
+    let text = files::read_text(path, KEY)?;
+    let certificate = CertificateDer::from_pem_slice(text.as_bytes());
+    let public = key.public_key_der();
+    let matches = certificate.is_ok_and(|c| c.windows(public.len()).any(|w| w == public));
+    match matches {
+        true => Ok(()),
+        false => {
+            let what = "is not the certificate of ca.key; use another folder";
+            Err(CliError::input(format!("{}: {what}", path.display())))
+        }
+    }
 }
 
 /// Returns the description of the authority, which is the same for each certificate it signs.

@@ -128,7 +128,17 @@ async fn follow_with(
     let shown = async {
         let mut window = Window::default();
         match hook.as_ref().map(Hook::start).transpose()?.flatten() {
-            Some(handled) => window.after = handled,
+            Some(handled) => {
+                let latest = Page { limit: 1, ..page };
+                let (latest, _) = client.history(newest(latest)).await?;
+                let latest = latest.last().map_or(0, |event| event.sequence);
+                window.after = handled.min(latest);
+                if handled > latest {
+                    output.warn(format!(
+                        "warning: the cursor is at event {handled}, but the latest is {latest}: the catalog is another, or was restored; going on from {latest}"
+                    ));
+                }
+            }
             None => {
                 let (first, ended) = client.history(newest(page)).await?;
                 window.after = first.first().map_or(0, |event| event.sequence - 1);
@@ -150,7 +160,12 @@ async fn follow_with(
                 Ok(false) => away = None,
                 Err(error) if error.code != Code::Coordinator => return Err(error),
                 Err(error) => {
-                    if away.get_or_insert_with(Instant::now).elapsed() > AWAY {
+                    let since = away.get_or_insert_with(|| {
+                        output.warn(format!("warning: {}; trying again", error.message));
+                        Instant::now()
+                    });
+                    // A command that sends messages outlives any pause of the coordinator.
+                    if hook.is_none() && since.elapsed() > AWAY {
                         return Err(error);
                     }
                     if let Ok(again) = client.reconnect().await {

@@ -4,6 +4,7 @@ use std::{
     io::Write,
     path::PathBuf,
     process::{Command, Stdio},
+    time::{Duration, Instant},
 };
 
 use picofarm_proto::{messages::Event, show};
@@ -13,6 +14,10 @@ use crate::{
     files,
     output::Output,
 };
+
+/// The time that a command may take.
+const LONGEST: Duration = Duration::from_secs(60);
+const PAUSE: Duration = Duration::from_millis(20);
 
 /// The kinds of events, but for lines that tasks log.
 const KINDS: [&str; 16] = [
@@ -120,7 +125,22 @@ impl Hook {
             // A command that does not read its input is no error.
             let _ = writeln!(stdin, "{}", serde_json::json!(event));
         }
-        let status = child.wait().map_err(failed)?;
+        let begun = Instant::now();
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(failed)? {
+                break status;
+            }
+            if begun.elapsed() > LONGEST {
+                let _ = child.kill();
+                child.wait().map_err(failed)?;
+                let s = LONGEST.as_secs();
+                output.warn(format!(
+                    "--run: the command took more than {s} s and was ended"
+                ));
+                return Ok(());
+            }
+            std::thread::sleep(PAUSE);
+        };
         if !status.success() {
             output.warn(format!(
                 "--run: the command ended with {status} for {name} of {}",

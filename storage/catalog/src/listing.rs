@@ -18,7 +18,7 @@ pub struct JobQuery {
     /// Only jobs of this user.
     pub user: Option<String>,
     /// Only jobs with this name or number, or with an id that begins with this text. A text of at
-    /// most nine digits is a number, not the beginning of an id.
+    /// most nine digits is a number, and neither a name nor the beginning of an id.
     pub find: Option<String>,
 }
 

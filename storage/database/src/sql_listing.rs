@@ -28,7 +28,8 @@ macro_rules! listing_queries {
                     "SELECT key, id, name, username, project, state, paused, submitted_ms, ended_ms, tasks, done, reused, \
                      dead FROM job WHERE key < $1 AND (CAST($2 AS BIGINT) IS NULL OR state = $2) \
                      AND (CAST($3 AS TEXT) IS NULL OR username = $3) \
-                     AND (CAST($4 AS TEXT) IS NULL OR name = $4 OR key = $11 OR (id >= $5 AND id <= $6)) AND ",
+                     AND (CAST($4 AS TEXT) IS NULL OR key = $11 OR (id >= $5 AND id <= $6) \
+                       OR (CAST($11 AS BIGINT) IS NULL AND name = $4)) AND ",
                     seen!("$7", "$8", "$9"),
                     " ORDER BY key DESC LIMIT $10"
                 ))

@@ -106,8 +106,21 @@ fn made_certificates_serve_a_farm_and_are_renewed_while_it_runs() {
     process.kill();
     fs::remove_file(scratch.join("tls/ca.key")).unwrap();
     cli.run(&make).fails(2, &["ca.pem", "without ca.key"]);
-    cli.run(&["certificates", "other", "--host", "é\u{7f}"])
-        .fails(2, &["--host"]);
+    for host in ["", "é", "bad host", "https://farm", "farm:7420"] {
+        let make = ["certificates", "other", "--host", host];
+        cli.run(&make).fails(2, &["--host", "name or an address"]);
+    }
+    cli.run(&["certificates", "other", "--host", "farm,::1"])
+        .ok();
+    fs::copy(scratch.join("tls/ca.pem"), scratch.join("other/ca.pem")).unwrap();
+    cli.run(&["certificates", "other", "--host", "farm"])
+        .fails(2, &["ca.pem", "not the certificate of ca.key"]);
+    fs::remove_file(scratch.join("other/ca.pem")).unwrap();
+    cli.run(&["certificates", "other", "--host", "farm"]).ok();
+    assert!(
+        scratch.join("other/ca.pem").exists(),
+        "it is made again from its key"
+    );
 }
 
 #[test]

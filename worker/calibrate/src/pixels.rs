@@ -66,11 +66,11 @@ impl Pixels {
         let (dark_bins, tops) = first_light(h, bins);
         let mut middle: Vec<f64> = tops.iter().copied().filter(|t| *t > 0.0).collect();
         let typical = quantile(&mut middle, 0.5).unwrap_or(1.0);
-        // Light in other units is taken for a bright measurement of 1000 photons in a bin.
-        let gain = if counts {
-            1.0
-        } else {
-            (1000.0 / typical) as f32
+        // Light in other units is taken for a bright measurement of 1000 photons in a bin, unless
+        // its values have steps, as photons in another unit or of a coarse code have.
+        let gain = match counts {
+            true => 1.0,
+            false => (1000.0 / typical).min(1.0 / step(cells)) as f32,
         };
         let totals: Vec<f64> = h.par_chunks(bins).map(sum).collect();
         let dark: Vec<f32> = h
@@ -201,6 +201,21 @@ fn first_light(h: &[f32], bins: usize) -> (usize, Vec<f64>) {
     (if dark < 4 { 0 } else { dark }, tops)
 }
 
+/// Returns the least difference between two values of a sample, zero among them. Differences that
+/// rounding to 32 bits explains do not count.
+fn step(cells: &[f32]) -> f64 {
+    const SAMPLE: usize = 200_000;
+    // Odd, so that not the same bins are read in every histogram.
+    let each = (cells.len() / SAMPLE) | 1;
+    let sample = cells.iter().step_by(each).map(|x| f64::from(*x));
+    let mut values: Vec<f64> = sample.filter(|x| x.is_finite() && *x > 0.0).collect();
+    values.push(0.0);
+    values.sort_by(f64::total_cmp);
+    let pairs = values.windows(2).map(|w| (w[1] - w[0], w[1]));
+    let steps = pairs.filter(|(step, value)| *step > 1e-5 * value);
+    steps.map(|(step, _)| step).fold(f64::INFINITY, f64::min)
+}
+
 /// The greatest count, if many bins hold exactly it.
 fn ceiling(cells: &[f32]) -> Option<(f32, usize)> {
     let most = cells.iter().copied().fold(0.0f32, f32::max);
@@ -268,7 +283,7 @@ pub(crate) fn unpile(h: &mut [f32], pulses: u64) {
 
 #[cfg(test)]
 mod tests {
-    use super::unpile;
+    use super::{step, unpile};
 
     #[test]
     fn coates_correction_returns_the_arriving_photons() {
@@ -287,5 +302,21 @@ mod tests {
         for (x, a) in seen.iter().zip(arriving) {
             assert!((f64::from(*x) / pulses - a).abs() < 1e-4, "{x} {a}");
         }
+    }
+
+    #[test]
+    fn photons_in_any_unit_and_code_have_steps_and_smooth_light_has_none() {
+        let counts: Vec<f32> = (0..5_000u32).map(|n| (n * 7919 % 61) as f32).collect();
+        let scaled: Vec<f32> = counts.iter().map(|n| n * 0.37).collect();
+        assert!((step(&scaled) - 0.37).abs() < 1e-4);
+        let code = |n: &f32| ((10.0 * n.sqrt()).round() / 10.0).powi(2);
+        let coded: Vec<f32> = counts.iter().map(code).collect();
+        assert!((0.5..=1.0).contains(&step(&coded)), "{}", step(&coded));
+        let bright: Vec<f32> = counts.iter().map(|n| (n + 400.0) * 0.37).collect();
+        assert!((step(&bright) - 0.37).abs() < 1e-3);
+        let smooth: Vec<f32> = (0..5_000u32)
+            .map(|n| (n as f32 * 0.7).sin().abs())
+            .collect();
+        assert!(step(&smooth) < 1e-3);
     }
 }

@@ -42,6 +42,11 @@ impl Fruitless {
         news
     }
 
+    /// Adds an allocation that was just submitted. It may end before the next round.
+    pub fn submitted(&mut self, id: &str) {
+        self.0.insert(id.to_owned(), false);
+    }
+
     /// Forgets an allocation that this program has cancelled.
     pub fn cancelled(&mut self, id: &str) {
         self.0.remove(id);
@@ -77,5 +82,8 @@ mod tests {
         // Its worker ended as it should, that of 2 never connected, and that of 4 is elsewhere.
         let news = fruitless.look(&[], |_| false);
         assert_eq!((news.connected, news.ended), (false, vec!["2".to_owned()]));
+        fruitless.submitted("5");
+        assert_eq!(fruitless.look(&[], |_| false).ended, ["5"]);
+        assert_eq!(fruitless.look(&[], |_| false), News::default());
     }
 }

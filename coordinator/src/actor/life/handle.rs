@@ -220,7 +220,7 @@ impl Life<'_> {
         };
         if state == JobState::Cancelled {
             return Ok(Err(Refusal::NotNow(format!(
-                "job {id} was cancelled; submit it again instead (finished tasks are reused)"
+                "job {id} was cancelled; submit its file with --again instead (finished tasks are reused)"
             ))));
         }
         let retried = match catalog.retry(id, self.now()).await {
