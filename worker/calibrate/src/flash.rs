@@ -112,6 +112,7 @@ fn taken_apart(m: &Measurement, model: &Model) -> Result<(Demultiplexed, f64), C
         ..m.capture
     };
     let settings = Settings {
+        remove_pulse: false,
         shadows: Shading::Physics,
         ..Settings::default()
     };

@@ -190,7 +190,7 @@ fn in_room(
         .collect();
     let (gate, bins) = (&merged, merged.bins as usize);
     let pulse = Pulse::of_returns(capture, &rays, &sources).map(|p| p.summed(per));
-    let histogram = match pulse.filter(|p| !p.is_narrow()) {
+    let histogram = match pulse.filter(|p| settings.remove_pulse && !p.is_narrow()) {
         Some(pulse) => pulse.remove(&histogram, gate, quiet(gate, &sources)),
         None => histogram,
     };

@@ -60,6 +60,10 @@ pub struct Settings {
     pub early_gap_m: f32,
     /// Rounds depth → shadows → depth.
     pub rounds: u32,
+    /// Whether a wide pulse is removed. It is read at the times that the calibration states, so
+    /// that a wrong calibration looks less wrong without it.
+    #[serde(skip_serializing_if = "Clone::clone")]
+    pub remove_pulse: bool,
     /// How shadows are judged.
     pub shadows: Shading,
 }
@@ -87,6 +91,7 @@ impl Default for Settings {
             early_slack_m: 0.2,
             early_gap_m: 0.1,
             rounds: 1,
+            remove_pulse: true,
             shadows: Shading::Learned,
         }
     }
