@@ -490,7 +490,7 @@ fn a_job_file_is_checked_without_a_coordinator() {
     let wrong = text.replace("resolution", "resolutoin");
     fs::write(scratch.join("wrong.toml"), wrong).unwrap();
     cli.run(&["job", "check", "wrong.toml"])
-        .fails(2, &["wrong.toml", "resolutoin", "resolution"]);
+        .fails(3, &["wrong.toml", "resolutoin", "resolution"]);
     cli.run(&["man", "manuals"]).ok();
     let page = fs::read_to_string(scratch.join("manuals/picofarm-job-check.1")).unwrap();
     assert!(page.contains("without a coordinator"), "{page}");
@@ -513,7 +513,7 @@ fn jobs_are_found_by_number_and_name_and_the_latest_as_last() {
         assert_eq!(status["id"].as_str(), Some(id.as_str()), "{name}: {status}");
     }
     farm.run(&["job", "status", "3"])
-        .fails(2, &["no job \"3\"", "job list"]);
+        .fails(3, &["no job \"3\"", "job list"]);
     let list = farm.run(&["job", "list"]).ok().stdout;
     let newest = list.lines().nth(1).unwrap();
     assert!(
@@ -561,5 +561,5 @@ fn a_command_runs_once_for_each_job_that_ends_also_after_a_restart() {
     );
     assert_eq!(heard.len(), 2);
     farm.run(&["events", "--follow", "--run", "true", "--kinds", "end"])
-        .fails(2, &["--kinds", "\"end\"", "ended"]);
+        .fails(3, &["--kinds", "\"end\"", "ended"]);
 }

@@ -105,16 +105,16 @@ fn made_certificates_serve_a_farm_and_are_renewed_while_it_runs() {
     at.run(&list).ok();
     process.kill();
     fs::remove_file(scratch.join("tls/ca.key")).unwrap();
-    cli.run(&make).fails(2, &["ca.pem", "without ca.key"]);
+    cli.run(&make).fails(3, &["ca.pem", "without ca.key"]);
     for host in ["", "é", "bad host", "https://farm", "farm:7420"] {
         let make = ["certificates", "other", "--host", host];
-        cli.run(&make).fails(2, &["--host", "name or an address"]);
+        cli.run(&make).fails(3, &["--host", "name or an address"]);
     }
     cli.run(&["certificates", "other", "--host", "farm,::1"])
         .ok();
     fs::copy(scratch.join("tls/ca.pem"), scratch.join("other/ca.pem")).unwrap();
     cli.run(&["certificates", "other", "--host", "farm"])
-        .fails(2, &["ca.pem", "not the certificate of ca.key"]);
+        .fails(3, &["ca.pem", "not the certificate of ca.key"]);
     fs::remove_file(scratch.join("other/ca.pem")).unwrap();
     cli.run(&["certificates", "other", "--host", "farm"]).ok();
     assert!(
