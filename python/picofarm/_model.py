@@ -26,10 +26,14 @@ class Model:
     Raises:
         ValueError: There is no such model, or another version made it.
         OSError: The store cannot be read, or the weights are damaged.
+        RuntimeError: The package was built without networks.
     """
 
     def __init__(self, store: str | os.PathLike[str], name: str) -> None:
         self.store, self.name = os.fspath(store), name
+        if not hasattr(_native, "Model"):
+            what = "this build has no networks"
+            raise RuntimeError(f"{what}; build it with `--features networks`")
         self._native = _native.Model(self.store, name)
         self.manifest: dict[str, Any] = json.loads(self._native.manifest())
         """Settings, plan, lineage and metrics."""
