@@ -118,7 +118,7 @@ fn write_authority(path: &Path, key: &KeyPair) -> Result<()> {
 fn check_pair(path: &Path, key: &KeyPair) -> Result<()> {
     let text = files::read_text(path, KEY)?;
     let certificate = CertificateDer::from_pem_slice(text.as_bytes());
-    let public = key.public_key_der();
+    let public = key.public_key_raw();
     let matches = certificate.is_ok_and(|c| c.windows(public.len()).any(|w| w == public));
     match matches {
         true => Ok(()),
