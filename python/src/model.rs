@@ -78,7 +78,6 @@ impl Model {
 
     /// Predicts `[plane, row, column]`: z-depth in metres, or probabilities of a mask for each
     /// spot. `spots` are rows of x, y, z and the path from the laser.
-    #[expect(clippy::too_many_arguments, reason = "a function of another language")]
     fn predict<'py>(
         &self,
         py: Python<'py>,
