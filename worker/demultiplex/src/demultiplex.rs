@@ -182,18 +182,17 @@ fn in_room(
     };
     let merged = merged(&capture.gate, settings);
     let per = (merged.bin_width_m / capture.gate.bin_width_m).round() as usize;
-    let histogram: Vec<f32> = capture
-        .histogram
-        .chunks(bins)
-        .flat_map(|h| h.chunks_exact(per))
-        .map(|part| part.iter().map(share).sum())
-        .collect();
+    // Whole at once, because a vector that grows needs twice the memory.
+    let mut histogram = Vec::with_capacity(rays.len() * merged.bins as usize);
+    for h in capture.histogram.chunks(bins) {
+        let wide = h.chunks_exact(per);
+        histogram.extend(wide.map(|part| part.iter().map(share).sum::<f32>()));
+    }
     let (gate, bins) = (&merged, merged.bins as usize);
     let pulse = Pulse::of_returns(capture, &rays, &sources).map(|p| p.summed(per));
-    let histogram = match pulse.filter(|p| settings.remove_pulse && !p.is_narrow()) {
-        Some(pulse) => pulse.remove(&histogram, gate, quiet(gate, &sources)),
-        None => histogram,
-    };
+    if let Some(pulse) = pulse.filter(|p| settings.remove_pulse && !p.is_narrow()) {
+        pulse.remove(&mut histogram, gate, quiet(gate, &sources));
+    }
     let sum = |h: &[f32]| h.iter().sum::<f32>();
     let intensity: Vec<f32> = histogram.chunks(bins).map(sum).collect();
     let log: Vec<f32> = intensity.iter().map(|x| libm::logf(x.max(1e-30))).collect();

@@ -124,12 +124,11 @@ impl Pulse {
         self.values[near].iter().sum::<f32>() >= NARROW
     }
 
-    /// Returns histograms without the pulse: the light of each bin that makes the counts most
-    /// likely if they are Poisson (Richardson 1972, Lucy 1974), with the ambient light of the first
-    /// `quiet` bins.
-    pub fn remove(&self, histogram: &[f32], gate: &Gate, quiet: usize) -> Vec<f32> {
+    /// Removes the pulse from histograms: what stays is the light of each bin that makes the counts
+    /// most likely if they are Poisson (Richardson 1972, Lucy 1974), with the ambient light of the
+    /// first `quiet` bins.
+    pub fn remove(&self, histogram: &mut [f32], gate: &Gate, quiet: usize) {
         let bins = gate.bins as usize;
-        let mut out = vec![0.0; histogram.len()];
         // Shares of each bin's light that the gate holds.
         let held: Vec<f32> = (0..bins)
             .map(|j| {
@@ -139,15 +138,15 @@ impl Pulse {
                 inside.map(|(_, k)| k).sum::<f32>()
             })
             .collect();
-        out.par_chunks_mut(bins)
-            .zip(histogram.par_chunks(bins))
-            .for_each_init(
-                || (vec![0.0f32; bins], vec![0.0f32; bins]),
-                |(model, ratio), (out, h)| {
-                    self.pixel(h, &held, mean(&h[..quiet.min(bins)]), out, model, ratio)
-                },
-            );
-        out
+        let empty = || vec![0.0f32; bins];
+        histogram.par_chunks_mut(bins).for_each_init(
+            || (empty(), empty(), empty()),
+            |(counts, model, ratio), pixel| {
+                counts.copy_from_slice(pixel);
+                let ambient = mean(&counts[..quiet.min(bins)]);
+                self.pixel(counts, &held, ambient, pixel, model, ratio)
+            },
+        );
     }
 
     fn pixel(

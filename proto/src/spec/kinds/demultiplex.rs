@@ -20,7 +20,7 @@ use crate::spec::{
 
 /// Bytes of a pixel for the ranges and the mirrors that the method tries, over the bytes of its
 /// histogram.
-const RANGES: f64 = 3.0;
+const RANGES: f64 = 3.5;
 /// Bytes of a pixel for each spot: shares of light, probabilities, and what they rest on.
 const PAIR: f64 = 40.0;
 
