@@ -77,6 +77,18 @@ for page in sorted(pathlib.Path("docs/decisions").glob("[0-9]*.md")):
     words = len(page.read_text().split())
     if words > 180:
         wrong.append(f"{page}: {words} words; at most 180")
+# Most columns of a table; and most words of a page without code. Generated pages have no limit of words.
+COLUMNS = {"docs/laboratory.md": 7}
+LIMITS = {"docs/benchmarks.md": 1600, "docs/calibration.md": 1300, "ARCHITECTURE.md": 1500, "CONTRIBUTING.md": 1300}
+for page in (*pathlib.Path("docs").glob("*.md"), pathlib.Path("ARCHITECTURE.md"), pathlib.Path("CONTRIBUTING.md")):
+    words = sum(bool(re.search(r"\w", word)) for word in prose(page).split())
+    limit = LIMITS.get(str(page), 900)
+    if page.name not in ("python-api.md", "reference.md") and words > limit:
+        wrong.append(f"{page}: {words} words without code; at most {limit}: shorten it, or move a part to another page")
+for page in pages:
+    for line in prose(page).splitlines():
+        if re.fullmatch(r"\|( *:?-+:? *\|)+", line) and line.count("|") - 1 > COLUMNS.get(str(page), 6):
+            wrong.append(f"{page}: a table of {line.count('|') - 1} columns; at most {COLUMNS.get(str(page), 6)}")
 lines = len(pathlib.Path("README.md").read_text().splitlines())
 if lines > 120:
     wrong.append(f"README.md: {lines} lines; at most 120")

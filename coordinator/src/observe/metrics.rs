@@ -158,7 +158,7 @@ impl Tally {
     }
 }
 
-/// ConnectionCounts of connections.
+/// Counts of connections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct ConnectionCounts {
     /// Open connections.

@@ -245,10 +245,10 @@ pub async fn replace(
     }
 }
 
-/// Puts metadata that count more in place of those that `counts_fewer`; what counts as many or more
-/// stays. Of several that put at a time the one that counts most stays, whichever comes last: an
-/// object is replaced only if it is still the one that was looked at. A store that cannot put on
-/// that condition (a folder) is looked at right before.
+/// Replaces metadata that `counts_fewer` by metadata with a higher count; an equal or higher count
+/// stays. Among concurrent writers the highest count remains, in any order: an object is replaced
+/// only if it has not changed since it was read. A store without conditional puts (a folder) is
+/// read again right before the put.
 pub async fn grow(
     store: &dyn ObjectStore,
     path: &Path,
@@ -279,14 +279,13 @@ pub async fn grow(
         let options = PutOptions::from(PutMode::Update(version));
         match store.put_opts(path, bytes.clone().into(), options).await {
             Ok(_) => return Ok(()),
-            // Another was faster. Each replacement counts more than the one before, so that this
-            // ends.
+            // Another writer was faster. Each replacement has a higher count, so the loop ends.
             Err(Error::Precondition { .. } | Error::AlreadyExists { .. })
                 if before.as_ref() != Some(&found) =>
             {
                 before = Some(found);
             }
-            // It cannot, or refuses what nobody has changed.
+            // The store has no conditional puts, or refuses one although nobody changed the object.
             Err(error) => {
                 tracing::debug!(object = %path, %error, "metadata are put without a condition");
                 conditional = false;

@@ -38,7 +38,7 @@ const NAME: &str = "folder";
 /// ones are flushed file by file, so that they do not wait for what other programs write.
 const SMALL: usize = 4 << 20;
 
-/// What a put does before it creates its object, as an extension of its options.
+/// The work of a put before it creates its object, as an extension of its options.
 #[derive(Clone)]
 struct Before {
     /// Objects to create.

@@ -3,7 +3,7 @@
 //! time follows from geometry. Nothing is learnt but the judgement of shadows, which may be left to
 //! rules.
 //!
-//! `docs/one-flash.md` explains the method and has the figures. This crate knows nothing of jobs or
+//! `docs/one-flash-method.md` explains the steps. This crate knows nothing of jobs or
 //! files.
 
 mod capture;

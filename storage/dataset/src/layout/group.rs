@@ -29,7 +29,7 @@ pub(crate) fn is_reconstructions(root: &Value) -> bool {
     root["attributes"]["picofarm"]["reconstructions"].is_u64()
 }
 
-/// Whether an array's metadata count fewer scenes.
+/// Returns whether an array's metadata count fewer scenes.
 pub(crate) fn counts_fewer(stored: &[u8], scenes: u64) -> bool {
     let stored: Value = serde_json::from_slice(stored).unwrap_or(Value::Null);
     stored["shape"][0]
@@ -37,8 +37,8 @@ pub(crate) fn counts_fewer(stored: &[u8], scenes: u64) -> bool {
         .is_none_or(|there| there < scenes)
 }
 
-/// Writes an array's metadata while its group has no root; `metadata` says what they are for a
-/// number of scenes. What an interrupted creation left is adopted if it differs at most in that
+/// Writes an array's metadata while its group has no root; `metadata` returns them for a number of
+/// scenes. Metadata that an interrupted creation left are adopted if they differ at most in that
 /// number.
 pub async fn create_metadata(
     store: &dyn ObjectStore,

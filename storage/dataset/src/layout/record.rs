@@ -217,7 +217,7 @@ impl Spot {
         [x, y, z, nx, ny, nz, self.path_m]
     }
 
-    /// Parses a row of the `spots` array; `None` if the beam meets nothing.
+    /// Parses a row of the `spots` array; `None` if the beam hits nothing.
     pub fn from_row(row: &[f32]) -> Option<Self> {
         (!row[0].is_nan()).then(|| Self {
             position: [row[0], row[1], row[2]],

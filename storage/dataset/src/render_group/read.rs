@@ -142,7 +142,7 @@ impl RenderGroup {
     }
 }
 
-/// A file of at most so many bytes.
+/// Reads a file of at most `most` bytes.
 fn bounded(path: &Path, most: u64) -> Result<Vec<u8>, StorageError> {
     let read = fs::File::open(path).and_then(|file| picofarm_files::read_bounded(file, most));
     read.map_err(|e| match e.kind() {

@@ -18,10 +18,10 @@ use picofarm_store::StorageError;
 
 /// Name of the picture in the folder of a single render.
 pub const SINGLE_PICTURE: &str = "preview.png";
-/// Name of the group of what data sets lack.
+/// Name of the group with the parts that data sets lack.
 const GROUP: &str = "render";
 
-/// What a single render has and data sets lack.
+/// The parts of a single render that data sets lack.
 #[derive(Debug, Clone, Copy)]
 pub struct SingleRenderParts<'a> {
     /// Arrays of the group `render`.
@@ -61,7 +61,7 @@ pub async fn write_single_render(
 pub struct SingleRender {
     /// The data set; its scene is 0.
     pub dataset: Dataset,
-    /// What data sets lack.
+    /// The parts that data sets lack.
     pub group: RenderGroup,
 }
 

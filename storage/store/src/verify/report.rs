@@ -41,7 +41,7 @@ pub enum Fault {
     BadManifest(String),
     /// A record is unusable.
     BadRecord {
-        /// What it belongs to.
+        /// The owner of the record.
         kind: RecordKind,
         /// The reason.
         why: String,
@@ -50,7 +50,7 @@ pub enum Fault {
     Foreign,
 }
 
-/// What a record belongs to, which decides how it is made again.
+/// The owner of a record, which decides how it is made again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RecordKind {
     /// A data set's snapshot, recipe or split.
@@ -61,7 +61,7 @@ pub enum RecordKind {
     Trial,
 }
 
-/// What to do about a problem.
+/// The remedy of a problem.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Remedy {
     /// The instruction for people.

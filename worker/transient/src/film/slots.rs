@@ -5,9 +5,9 @@ use crate::{
     film::class::{CLASSES, Connection, PathPlace, class},
 };
 
-/// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds
-/// all spots, each further one a group of spots. A channel has one *slot* a bin, with one more in
-/// front for what comes before the gate and one behind for what comes after.
+/// The layout of histograms while they are filled. A *channel* is one histogram: channel 0 is of
+/// all spots, each further one of a group of spots. A channel has one *slot* for each bin, one in
+/// front for light before the gate, and one behind for light after it.
 #[derive(Debug)]
 pub(crate) struct Film {
     pub gate: Gate,
@@ -22,7 +22,7 @@ pub(crate) struct Film {
 }
 
 impl Film {
-    /// A film for a gate, so many groups, and the groups that each emitter belongs to.
+    /// Returns a film for a gate and `groups` groups of spots; `of_spot` has those of each emitter.
     pub fn new(gate: &Gate, groups: usize, of_spot: Vec<Vec<u16>>) -> Self {
         Self {
             gate: *gate,
@@ -33,7 +33,7 @@ impl Film {
         }
     }
 
-    /// A film that has a channel for each class of paths.
+    /// Returns a film with a channel for each class of paths.
     pub fn by_class(gate: &Gate) -> Self {
         let of_class = (0..CLASSES).map(|c| vec![1 + c as u16]).collect();
         Self {

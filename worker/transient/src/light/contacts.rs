@@ -118,7 +118,7 @@ impl Contacts {
         self.zones.len() as u32
     }
 
-    /// How many spots have one, those at one place counted once.
+    /// Returns the number of spots with a zone; spots at one place count once.
     pub fn spots(&self) -> usize {
         places(self.zones.iter().map(|z| z.centre))
     }
@@ -300,7 +300,7 @@ pub(crate) fn many(emitters: &Emitters, tuning: &ContactTuning) -> bool {
     places(emitters.list.iter().map(|e| e.p)) as f32 > tuning.few
 }
 
-/// How many places sources have.
+/// Returns the number of distinct places of sources.
 fn places(sources: impl Iterator<Item = Vec3>) -> usize {
     let bits = |p: Vec3| [p.x, p.y, p.z].map(f32::to_bits);
     sources.map(bits).collect::<HashSet<_>>().len()

@@ -235,8 +235,8 @@ mod tests {
             let mut aiming = Aiming::default();
             prop_assume!(aiming.weigh(&all, often, points.into_iter()));
             let mut rng = Rng::new(seed, Stream::Paths, 0, 0);
-            // ShadingPoint from a point above each triangle's middle, the density per steradian
-            // agrees with the density per area.
+            // From a point above each triangle's middle, the density per steradian agrees with the
+            // density per area.
             let mut said = vec![];
             for r in &all.list {
                 let m = hit(r.triangle, r.middle, r.normal);

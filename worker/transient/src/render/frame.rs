@@ -1,4 +1,4 @@
-//! What all tiles of a render share.
+//! The values that all tiles of a render share.
 
 use crate::{
     film::slots::Film,

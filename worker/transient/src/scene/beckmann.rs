@@ -1,7 +1,7 @@
 //! Samples the visible facets of Beckmann's distribution (Heitz and d'Eon, EGSR 2014) without
 //! inverting a distribution function.
 //!
-//! ShadingPoint under the angle θ, a facet of slope (x, y)·α, with x towards the direction, has the
+//! Seen under the angle θ, a facet of slope (x, y)·α, with x towards the direction, has the
 //! weight (a + x)·e^(−x²−y²) if a + x > 0, with a = 1/(α·tan θ). So y is normally distributed. For
 //! x, the pair ±r has the total weight 2a·e^(−r²) if r < a; beyond a only +r counts, with the
 //! weight (a + r)·e^(−r²).

@@ -20,9 +20,9 @@ pub(crate) struct Hit {
 }
 
 impl Hit {
-    /// Settles a mix on one of its parts where one is too narrow for pixels to share its vertices,
-    /// so that each path is of one kind: by way of a near-mirror's lobe, or of others. A mix of
-    /// wide lobes stays: its vertices scatter by both.
+    /// Chooses one part of a mix if one of them is too narrow for pixels to share its vertices, so
+    /// that each path uses either a near-mirror's lobe or another. A mix of wide lobes stays, and
+    /// its vertices scatter by both.
     #[inline(always)]
     pub fn choose_lobe(&mut self, rng: &mut Rng) {
         if self.surface.is_open() {

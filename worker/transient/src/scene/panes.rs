@@ -1,4 +1,4 @@
-//! PassFraction glass. It is not a surface: light passes straight through it, and a straight
+//! Thin glass. It is not a surface: light passes straight through it, and a straight
 //! segment between two points carries the share of light that the panes on it transmit. So every
 //! technique of the renderer stays the same, with that share as the visibility, and the sampling
 //! densities do not change. Light that glass reflects has techniques of its own:

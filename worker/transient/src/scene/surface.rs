@@ -98,16 +98,15 @@ impl Surface {
                     surface(Kind::Mixed, strength, alpha, base)
                 }
             }
-            // PassFraction glass is no surface (see `glass`); what bodies of glass do is no
-            // scattering (see `by_glass`).
+            // Thin glass is no surface (see `panes`), and bodies of glass do not scatter.
             Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
                 surface(Kind::Lambertian, 0.0, 0.0, 0.0)
             }
         }
     }
 
-    /// A mix to draw directions by at a vertex that pixels share: as this surface scatters, half of
-    /// it or more Lambertian, of albedo 1.
+    /// Returns the surface by which directions are drawn at a vertex that pixels share: a mix of
+    /// albedo 1 in the proportions of this surface, at least half of it Lambertian.
     pub fn guide(self) -> Self {
         let base = self.base.max(0.5 * self.albedo() / PI);
         let all = 1.0 / (self.strength + base * PI);
@@ -119,7 +118,7 @@ impl Surface {
         }
     }
 
-    /// Share of light that it sends on, as far as masking lets it.
+    /// Returns the share of light that the surface scatters, before masking.
     #[inline]
     pub fn albedo(&self) -> f32 {
         match self.kind {
@@ -197,8 +196,8 @@ impl Surface {
         matches!(self.kind, Kind::Mixed)
     }
 
-    /// True for a mix of which a path must settle on one part: all but those whose vertices pixels
-    /// share. Their lobes are both wide, so that a vertex can scatter by both.
+    /// Returns whether a path must choose one part of this mix. If pixels share its vertices, both
+    /// lobes are wide, and a vertex scatters by both.
     #[inline(always)]
     pub fn is_open(&self) -> bool {
         match self.kind {

@@ -56,11 +56,11 @@ pub(crate) struct World {
     pub camera: Camera,
     /// Side of the sensitive square in the middle of each pixel, as a fraction of the pixel's side.
     pub sensitive: f32,
-    /// PassFraction glass. Its triangles are not among `triangles`.
+    /// Thin glass. Its triangles are not among `triangles`.
     pub panes: Option<Panes>,
     /// Glass bodies by surface index; empty if there are none.
     pub bodies: Vec<Option<Body>>,
-    /// What texels do to surfaces at the wavelength asked for, by surface index; empty without one.
+    /// Effect of texels at the laser's wavelength, by surface index; empty without a wavelength.
     pub texels: Vec<Option<Texels>>,
 }
 

@@ -60,7 +60,7 @@ pub struct GlassTuning {
     pub photon_alike: f32,
     /// Least probability of choosing a body's reflection, if it reflects at all.
     pub reflect: f32,
-    /// EvenDraws of one leg before Russian roulette starts for rays that lost light. Roulette must
+    /// Turns of one leg before Russian roulette starts for rays that lost light. Roulette must
     /// not end rays under repeated total reflection, because the few survivors would have a large
     /// weight.
     pub sure_turns: u32,

@@ -89,7 +89,7 @@ pub(super) struct Description {
     pub events: Option<EventsText>,
 }
 
-/// When the bins are.
+/// The times of the bins.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct GateText {

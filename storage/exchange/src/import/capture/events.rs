@@ -139,7 +139,7 @@ impl Binner {
     }
 }
 
-/// What happens during a scan.
+/// An event of a scan.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Event {
     /// A photon after `ps` picoseconds.

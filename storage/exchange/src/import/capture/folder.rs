@@ -51,8 +51,8 @@ impl Capture {
     /// all.
     ///
     /// # Errors
-    /// [`StorageError::Invalid`] for values that no data set holds, and if `dir` exists and is not
-    /// empty; [`StorageError::Io`]; [`StorageError::Store`].
+    /// [`StorageError::Invalid`] for values that no data set can store, and if `dir` exists and is
+    /// not empty; [`StorageError::Io`]; [`StorageError::Store`].
     pub async fn write(&self, dir: &Path, picture: &[u8]) -> Result<(), StorageError> {
         let spec = DatasetSpec {
             scenes: 1,

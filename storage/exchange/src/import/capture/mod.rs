@@ -50,7 +50,7 @@ pub enum Beam {
     },
     /// The direction in which the beam leaves the laser, as a unit vector.
     Direction([f32; 3]),
-    /// The beam meets nothing.
+    /// The beam hits nothing.
     Nothing,
 }
 
@@ -78,18 +78,18 @@ pub struct Capture {
     pub beams: Vec<Beam>,
     /// True z-depth in metres, `[row][column]`, 0 = unknown, if the files have it.
     pub depth: Option<Vec<f32>>,
-    /// Where the capture is from.
+    /// The origin of the capture.
     pub origin: Origin,
 }
 
-/// Where a capture is from and what was done on the way in.
+/// The source of a capture, and the conversions of its import.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Origin {
     /// The format of the files, for example `numpy`.
     pub format: String,
     /// The files with their SHA-256.
     pub files: Vec<SourceFile>,
-    /// What was converted or assumed, one sentence each.
+    /// The conversions and assumptions, one sentence each.
     pub conversions: Vec<String>,
     /// Photons (or energy) of the files outside the gate that was kept.
     pub outside: f64,

@@ -13,7 +13,7 @@ const MOST_SIDE: u64 = 1 << 14;
 /// Most bins of a gate, as data sets have.
 const MOST_BINS: f64 = 262_144.0;
 
-/// What to change. The default changes nothing, to the bit.
+/// The changes. The default changes nothing, to the bit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Resampling {
     /// Start of the gate, metres of path after scaling.

@@ -129,8 +129,8 @@ impl GlassTechnique<'_> {
         let from = emitters.lifted[spot];
         let hit = world.ahead(stack, from, w, &mut buffers.crossings);
         let body = hit.as_ref().and_then(|h| world.body(h.triangle));
-        // StraightShares of the light that are turned in this direction: by each pane, and by a
-        // body behind the panes.
+        // Shares of the light that are turned in this direction: by each pane, and by a body behind
+        // the panes.
         let shares = StraightShares::new(&buffers.crossings, hit.as_ref());
         let straight = if body.is_some() { shares.straight } else { 0.0 };
         let total = shares.reflected + straight;

@@ -84,8 +84,8 @@ impl Photons {
         [p.x, p.y, p.z].map(|x| (x / self.cell).floor() as i32)
     }
 
-    /// Calls `each` with what every photon near a camera path's point brings; without `spots`, what
-    /// lies behind the first bounce alone.
+    /// Calls `each` with the contribution of every photon near a camera path's point. Without
+    /// `spots`, photons of the first bounce are left out.
     pub(crate) fn around(
         &self,
         tracer: &Tracer,

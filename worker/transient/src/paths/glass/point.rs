@@ -38,8 +38,8 @@ pub(crate) struct Point {
 }
 
 impl Point {
-    /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive`
-    /// says with which chance a step of a weight does.
+    /// Continues a path of flux by the surface's scattering. Returns its new state and the ray.
+    /// `survive` gives the probability that a step of a weight survives.
     pub fn scatter(&self, survive: impl Fn(f32) -> f32, rng: &mut Rng) -> Option<(PathState, Ray)> {
         let h = &self.hit;
         let ScatterSample { w, weight, .. } = h.surface.sample(h.n, self.back, rng)?;
@@ -50,9 +50,9 @@ impl Point {
         Some(self.onward((w, weight / chance), false))
     }
 
-    /// Radiance goes on by the surface's scattering or to where glass is. What the path carries
-    /// then, the ray, and what is left of `left`: what it would carry by scattering alone, since
-    /// how narrow the cones are says nothing of what lies in them. Roulette goes by that.
+    /// Continues a path of radiance by the surface's scattering or towards glass. Returns its new
+    /// state, the ray, and the new `left`: the remaining weight by scattering alone. Russian
+    /// roulette uses it, because the width of the cones does not depend on the light within them.
     pub fn seek(
         &self,
         aim: &AimSpheres,

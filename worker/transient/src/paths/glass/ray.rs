@@ -107,7 +107,7 @@ impl Ray {
     }
 }
 
-/// StraightShares of the light along a straight segment.
+/// Shares of the light along a straight segment.
 pub(crate) struct StraightShares {
     pub reflected: f32,
     /// Share that passes all panes, if there is a surface behind them.

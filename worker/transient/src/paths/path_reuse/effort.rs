@@ -32,7 +32,7 @@ pub(crate) struct Effort {
     pub spots: (u32, u32),
 }
 
-/// What a pass over a tile is made with.
+/// The tracer, film and effort of a pass over a tile.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PassContext<'a> {
     pub tracer: &'a Tracer<'a>,

@@ -74,7 +74,7 @@ fn key(b: &Aabb) -> [i64; 7] {
     [x, y, z, u, v, w, i64::from(size.to_bits())]
 }
 
-/// EvenDraws a tree over groups into one over their members.
+/// Turns a tree over groups into one over their members.
 pub(crate) fn expand(tree: &mut Bvh2, groups: &[Group], boxes: &[Aabb]) {
     let held = std::mem::take(&mut tree.primitive_indices);
     for n in 0..tree.nodes.len() {

@@ -14,7 +14,7 @@ use super::{Described, Description};
 /// Most beams of a capture.
 const MOST_BEAMS: usize = 1 << 14;
 
-/// What a capture needs besides histograms.
+/// The calibration that a capture needs in addition to histograms.
 pub(in super::super) struct Calibration {
     pub gate: Gate,
     pub intrinsics: Intrinsics,
