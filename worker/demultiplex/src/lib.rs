@@ -35,6 +35,7 @@ pub use demultiplex::{Demultiplexed, demultiplex, shadows_at, with_evidence};
 pub use error::DemultiplexError;
 pub use evidence::Evidence;
 pub use residual::{Residual, residual};
+pub use scale::room_factor;
 pub use score::{DepthScore, MaskScore, Truth};
 pub use separate::{SEPARATE_VERSION, Separate, separate};
 pub use settings::{Settings, Shading};

@@ -14,11 +14,15 @@ const MOST_M: f32 = 5.0;
 /// Returns the power of two by which a capture's lengths are multiplied; 1 for rooms.
 pub fn factor(capture: &Capture) -> f32 {
     let camera = capture.camera;
-    let mut all: Vec<f32> = places(capture)
-        .iter()
-        .flatten()
-        .map(|place| camera.to_camera(place.point).length())
-        .collect();
+    let places = places(capture);
+    let places = places.iter().flatten();
+    room_factor(places.map(|place| camera.to_camera(place.point).length()))
+}
+
+/// Returns the power of two that gives a scene the size of a room, from the distances of its spots
+/// from the camera, metres; 1 for rooms, and without spots.
+pub fn room_factor(spots_m: impl Iterator<Item = f32>) -> f32 {
+    let mut all: Vec<f32> = spots_m.collect();
     if all.is_empty() {
         return 1.0;
     }

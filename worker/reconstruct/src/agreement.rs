@@ -8,7 +8,12 @@ use picofarm_scene::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{Depth, Measured, closed_form::smooth, paths::Paths};
+use crate::{
+    Depth, Measured,
+    closed_form::smooth,
+    paths::Paths,
+    scale::{in_room, lengths},
+};
 
 pub(crate) use times::{Times, times};
 
@@ -68,19 +73,28 @@ impl Agreement {
     /// Computes the agreement of depths that do not come from times: distances along the rays, and
     /// spots; if `masks` is set, also their shadows.
     pub fn of_depths(measured: &Measured, range: &[f32], masks: bool) -> Self {
-        let depth = Depth {
-            range: range.to_vec(),
-            error: vec![UNKNOWN_M; range.len()],
-            normal: vec![Vec3::ZERO; range.len()],
-        };
-        let depth = smooth(measured, &depth);
-        judge(measured, figures(measured, &depth, None, masks))
+        let mut measured = measured.clone();
+        in_room(&mut measured, |measured, factor| {
+            let depth = Depth {
+                range: lengths(range, factor),
+                error: vec![UNKNOWN_M; range.len()],
+                normal: vec![Vec3::ZERO; range.len()],
+            };
+            let depth = smooth(measured, &depth);
+            judge(measured, figures(measured, &depth, None, masks), factor)
+        })
     }
 }
 
-/// Computes the agreement of measurements with the depths and normals computed from them.
-pub(crate) fn check(measured: &Measured, depth: &Depth, times: &Times) -> Agreement {
-    judge(measured, figures(measured, depth, Some(times), true))
+/// Computes the agreement of measurements with the depths and normals computed from them. The
+/// lengths of the measurements are those of the scene times `factor`; those of the result are the
+/// scene's.
+pub(crate) fn check(measured: &Measured, depth: &Depth, times: &Times, factor: f32) -> Agreement {
+    judge(
+        measured,
+        figures(measured, depth, Some(times), true),
+        factor,
+    )
 }
 
 fn figures(measured: &Measured, depth: &Depth, times: Option<&Times>, masks: bool) -> Agreement {
@@ -114,9 +128,10 @@ fn figures(measured: &Measured, depth: &Depth, times: Option<&Times>, masks: boo
 
 /// Adds the verdict on the figures. The thresholds are between the figures of consistent rooms and
 /// those of wrong input; the example `agreement` measures both, and docs/benchmarks.md has the
-/// figures.
-fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
+/// figures. Lengths are those of the scene times `factor`; those of the result are the scene's.
+fn judge(measured: &Measured, mut of: Agreement, factor: f32) -> Agreement {
     let bin = measured.bin_width_m;
+    let metres = |m: f32| format!("{:.3} m", m / factor);
     let mut say = |refused: bool, text: String| {
         of.verdict = match refused {
             true => Verdict::Contradicts,
@@ -126,8 +141,9 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
     };
     if let Some(residual) = of.time_residual_m.filter(|r| *r > RESIDUAL.doubtful(bin)) {
         let text = format!(
-            "times of a pixel's spots give different depths: they differ by {residual:.3} m of path (median); check which \
-             spot each belongs to, their axes and units, and the image's axes"
+            "times of a pixel's spots give different depths: they differ by {} of path (median); check which \
+             spot each belongs to, their axes and units, and the image's axes",
+            metres(residual)
         );
         say(residual > RESIDUAL.refused(bin), text);
     }
@@ -137,8 +153,9 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
         .filter(|(_, r)| *r > SPOT.doubtful(bin) && *r > SPOT_TIMES * usual)
     {
         let text = format!(
-            "times of spot {beam} are {residual:.3} m of path away from what the others give (median); is it exchanged for \
-             another, or in another place?"
+            "times of spot {beam} are {} of path away from what the others give (median); is it exchanged for \
+             another, or in another place?",
+            metres(residual)
         );
         say(residual > SPOT.refused(bin), text);
     }
@@ -148,8 +165,8 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
         .filter(|o| judged && o.abs() > OFFSET.doubtful(bin))
     {
         let text = format!(
-            "all times are {:.3} m of path too {}; check where the gate begins",
-            offset.abs(),
+            "all times are {} of path too {}; check where the gate begins",
+            metres(offset.abs()),
             if offset > 0.0 { "late" } else { "early" }
         );
         say(offset.abs() > OFFSET.refused(bin), text);
@@ -159,7 +176,8 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
         .filter(|o| *o > OFF_SURFACE.doubtful(0.0))
     {
         let text = format!(
-            "spots lie {off:.3} m off the surfaces around them (median); check their units and axes, and the depths"
+            "spots lie {} off the surfaces around them (median); check their units and axes, and the depths",
+            metres(off)
         );
         say(off > OFF_SURFACE.refused(0.0), text);
     }
@@ -194,6 +212,7 @@ fn judge(measured: &Measured, mut of: Agreement) -> Agreement {
         );
         say(share > LIGHT.refused(0.0), text);
     }
+    of.scale(1.0 / factor);
     of
 }
 

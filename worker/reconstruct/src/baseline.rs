@@ -9,6 +9,7 @@ use crate::{
     closed_form::{closed_form, on_ellipsoid, smooth},
     field::{EMPTY, Field, SOLID, Skip},
     planes::{planes, settle},
+    scale,
     start::{State, bounds, start},
 };
 
@@ -88,11 +89,13 @@ pub fn depth_alone(
     checked(settings)?;
     measured.check()?;
     let mut measured = measured.clone();
+    let factor = scale::factor(&measured);
+    measured.scale(factor);
     let raw = closed_form(&mut measured).0;
     some_depth(&raw)?;
     let mut depth = smooth(&measured, &raw);
     let (walls, _) = match settings.planes {
-        true => planes(&measured, &depth, settings.seed),
+        true => planes(&measured, &depth, (settings.seed, factor)),
         false => (Vec::new(), Vec::new()),
     };
     settle(&measured, &mut depth, &walls);
@@ -107,6 +110,7 @@ pub fn depth_alone(
             };
         }
     }
+    field.scale(1.0 / factor);
     Ok(field)
 }
 

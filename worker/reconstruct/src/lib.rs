@@ -24,6 +24,7 @@ mod reconstruction;
 pub mod render;
 mod rng;
 pub mod saved;
+mod scale;
 pub mod score;
 pub mod source;
 mod start;
@@ -45,4 +46,4 @@ pub use world::{Hit, World};
 
 /// The version of the reconstruction, which is part of every task key. Change it whenever any bit
 /// of a result may change.
-pub const VERSION: &str = "reconstruct-8";
+pub const VERSION: &str = "reconstruct-9";

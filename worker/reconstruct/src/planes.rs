@@ -54,8 +54,12 @@ type Point = (Vec3, Vec3);
 
 /// Finds planes by random sample consensus (Fischler and Bolles 1981) over the pixels' points and
 /// normals, the largest first, each refined by least squares. Returns those that are walls, and
-/// notes on the others and on openings.
-pub(crate) fn planes(measured: &Measured, depth: &Depth, seed: u64) -> (Vec<Wall>, Vec<String>) {
+/// notes on the others and on openings. The lengths are those of the scene times `factor`.
+pub(crate) fn planes(
+    measured: &Measured,
+    depth: &Depth,
+    (seed, factor): (u64, f32),
+) -> (Vec<Wall>, Vec<String>) {
     let mut errors: Vec<f32> = depth
         .error
         .iter()
@@ -120,7 +124,7 @@ pub(crate) fn planes(measured: &Measured, depth: &Depth, seed: u64) -> (Vec<Wall
             share: (count * STRIDE) as f32 / depth.range.len() as f32,
         });
     }
-    let (mut found, notes) = walls(measured, depth, (&found, close));
+    let (mut found, notes) = walls(measured, depth, (&found, close), factor);
     found.truncate(MOST);
     (found, notes)
 }

@@ -14,6 +14,7 @@ use crate::{
     paths::Paths,
     planes::{Plane, confine, planes, settle},
     progress::{Phase, Progress, begin},
+    scale,
     start::{State, bounds, start},
     unlit,
     walls::Wall,
@@ -59,8 +60,11 @@ pub struct Reconstructed {
 }
 
 /// A reconstruction in progress.
+///
+/// Its lengths are those of a room; [`Self::finish`] divides them by `factor`.
 pub struct Reconstruction {
     settings: Settings,
+    factor: f32,
     measured: Measured,
     depth: Depth,
     planes: Vec<Plane>,
@@ -102,6 +106,8 @@ impl Reconstruction {
             .check()
             .map_err(|(field, what)| ReconstructError::invalid(field, what))?;
         let mut notes = measured.check()?;
+        let factor = scale::factor(&measured);
+        measured.scale(factor);
         begin(progress, Phase::Depth)?;
         let (mut raw, times) = closed_form(&mut measured);
         if !raw.range.iter().any(|r| r.is_finite()) {
@@ -111,11 +117,11 @@ impl Reconstruction {
         let lit = smooth(&measured, &raw);
         begin(progress, Phase::Planes)?;
         let (walls, seen) = match settings.planes {
-            true => planes(&measured, &lit, settings.seed),
+            true => planes(&measured, &lit, (settings.seed, factor)),
             false => (Vec::new(), Vec::new()),
         };
         notes.extend(seen);
-        let agreement = agreement::check(&measured, &lit, &times);
+        let agreement = agreement::check(&measured, &lit, &times, factor);
         let mut depth = match unlit::add(&measured, &mut raw) {
             0 => lit,
             _ => smooth(&measured, &raw),
@@ -157,6 +163,7 @@ impl Reconstruction {
         }
         Ok(Self {
             settings,
+            factor,
             measured,
             depth,
             planes: walls.iter().map(|w| w.plane).collect(),
@@ -225,8 +232,12 @@ impl Reconstruction {
     }
 
     /// Returns the current result.
-    pub fn finish(self) -> Reconstructed {
+    pub fn finish(mut self) -> Reconstructed {
+        let back = 1.0 / self.factor;
+        self.measured.scale(back);
+        self.depth.scale(back);
         let mut field = self.field;
+        field.scale(back);
         let (mut loss, mut held_out_loss, mut iterations) = (None, None, 0);
         if let Some(saved) = self.saved {
             for (&i, u) in self.trainable.0.iter().zip(&saved.logits) {
@@ -240,7 +251,7 @@ impl Reconstruction {
             field,
             evidence: self.evidence,
             depth: self.depth,
-            planes: self.planes,
+            planes: self.planes.iter().map(|p| p.scaled(back)).collect(),
             measured: self.measured,
             loss,
             held_out_loss,

@@ -10,6 +10,7 @@ use crate::{
     Depth, Measured,
     closed_form::{closed_form, on_ellipsoid, smooth},
     planes::planes,
+    scale::{in_room, lengths},
     walls::Wall,
 };
 
@@ -33,6 +34,12 @@ const JOINED: f32 = 0.06;
 /// Leaves lonely times unused, and sets [`Measured::unlit_range_m`] of the pixels without depth.
 /// `first` has the paths of first light, `[spot][row][column]`, metres; NaN = unknown.
 pub(crate) fn fill(measured: &mut Measured, first: &[f32]) {
+    in_room(measured, |measured, factor| {
+        fill_room(measured, &lengths(first, factor));
+    });
+}
+
+fn fill_room(measured: &mut Measured, first: &[f32]) {
     let pixels = measured.pixels();
     let mut refined = measured.clone();
     let raw = closed_form(&mut refined).0;
@@ -48,7 +55,7 @@ pub(crate) fn fill(measured: &mut Measured, first: &[f32]) {
             }
         }
     }
-    let (walls, _) = planes(&refined, &depth, 0);
+    let (walls, _) = planes(&refined, &depth, (0, 1.0));
     let mut found = vec![f32::NAN; pixels];
     let wanted: Vec<Option<f32>> = (0..pixels)
         .map(|p| {

@@ -67,11 +67,13 @@ fn cell(frame: &[Vec3; 3], x: Vec3) -> [f32; 2] {
     [way.dot(frame[1]) / CELL_M, way.dot(frame[2]) / CELL_M]
 }
 
-/// Returns the walls among planes, and notes on the planes that are none and on openings.
+/// Returns the walls among planes, and notes on the planes that are none and on openings. The
+/// lengths are those of the scene times `factor`.
 pub(crate) fn walls(
     measured: &Measured,
     depth: &Depth,
     (planes, close): (&[Candidate], f32),
+    factor: f32,
 ) -> (Vec<Wall>, Vec<String>) {
     let points: Vec<(usize, Vec3)> = (0..depth.range.len())
         .filter(|&p| depth.range[p].is_finite() && !measured.is_doubtful(p))
@@ -83,10 +85,11 @@ pub(crate) fn walls(
             continue;
         };
         let [closed, open] = wall.seen_m2;
+        let [shut, through] = wall.seen_m2.map(|m2| area(m2 / (factor * factor)));
         if closed < LEAST_M2 || closed < LEAST_CLOSED * (closed + open) {
             if closed >= LEAST_M2 {
                 notes.push(format!(
-                    "a plane that {:.1} % of the pixels see is no wall: {closed:.1} m² of it are closed, and {open:.1} m² are open",
+                    "a plane that {:.1} % of the pixels see is no wall: {shut} of it are closed, and {through} are open",
                     100.0 * candidate.share
                 ));
             }
@@ -94,12 +97,20 @@ pub(crate) fn walls(
         }
         if open >= NOTED_M2 {
             notes.push(format!(
-                "a wall is open: {closed:.1} m² of its plane are closed, and {open:.1} m² are open"
+                "a wall is open: {shut} of its plane are closed, and {through} are open"
             ));
         }
         found.push(wall);
     }
     (found, notes)
+}
+
+/// Formats an area.
+fn area(m2: f32) -> String {
+    match m2 < 0.1 {
+        true => format!("{:.0} cm²", 1e4 * m2),
+        false => format!("{m2:.1} m²"),
+    }
 }
 
 /// Divides a plane into cells by the votes of pixels. Returns `None` if the camera is behind it.

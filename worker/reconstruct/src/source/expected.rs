@@ -13,6 +13,7 @@ use crate::{
     Measured,
     closed_form::{closed_form, smooth},
     paths::Paths,
+    scale::in_room,
 };
 
 /// The share of the expected light below which a pixel is in shadow.
@@ -44,9 +45,28 @@ pub(super) struct Return {
     pub noise: f32,
 }
 
+impl Return {
+    /// Returns the same with lengths multiplied by a factor.
+    fn scaled(&self, factor: f32) -> Self {
+        Self {
+            path_m: self.path_m * factor,
+            first_m: self.first_m * factor,
+            ..*self
+        }
+    }
+}
+
 /// Replaces masks and times by those that agree with the depth from all spots. `returns`:
 /// `[spot][row][column]`.
 pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
+    in_room(&mut measured, |measured, factor| {
+        let scaled = returns.iter().map(|r| r.scaled(factor));
+        decide_all(measured, &scaled.collect::<Vec<_>>());
+    });
+    measured
+}
+
+fn decide_all(measured: &mut Measured, returns: &[Return]) {
     let (pixels, k) = (measured.pixels(), measured.spots.len());
     let tolerance = BINS * measured.bin_width_m;
     let mut refined = measured.clone();
@@ -114,14 +134,13 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
     if !decided.contains(&(1, 1)) {
         // The image is too coarse for normals, or no times agree, so only the threshold is
         // available.
-        return measured;
+        return;
     }
     for (q, (lit, used)) in decided.into_iter().enumerate() {
         measured.tau[q] = if lit != 0 { returns[q].path_m } else { 0.0 };
         measured.lit[q] = lit;
         measured.used[q] = used;
     }
-    measured
 }
 
 /// Returns the lower median, or NaN if there are no values.

@@ -3,9 +3,14 @@
 //! and E: two-bounce times follow from depth by geometry), and the results of another instrument's
 //! own processing.
 
+use picofarm_demultiplex::room_factor;
 use picofarm_scene::{Camera, Vec3};
 
 use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
+
+/// The least difference between the path to a spot and its distance from the laser by which a mirror
+/// reflected the beam, metres in a scene of the size of a room.
+const FOLDED_M: f32 = 1e-2;
 
 /// The depth and masks of one scene. Images are row-major, `[row][column]`.
 #[derive(Debug, Clone, Copy)]
@@ -82,6 +87,8 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
             return Err(ReconstructError::invalid(field, what));
         }
     }
+    let places = given.spots.iter().flatten();
+    let factor = room_factor(places.map(|(point, _)| (*point - given.camera.origin).length()));
     for (image, (&number, lit)) in given
         .beams
         .iter()
@@ -137,7 +144,7 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
             direction: (point - given.laser).normalized(),
             point,
             path_m,
-            folded: (straight - path_m).abs() > 1e-2,
+            folded: (straight - path_m).abs() * factor > FOLDED_M,
         });
     }
     Ok(measured)

@@ -9,4 +9,5 @@ mod masks;
 mod rays;
 mod rooms;
 mod same_bytes;
+mod scale;
 mod walls;
