@@ -7,8 +7,8 @@
     while state["epoch"] < run.parameters.get("epochs", 10):
         loss = train_epoch(state, data, run.parameters["lr"])
         state["epoch"] += 1
-        run.checkpoint(state, step=state["epoch"])
         run.report(epoch=state["epoch"], loss=loss)
+        run.checkpoint(state, step=state["epoch"])
     run.artifact("weights.npz")
 
 A stage of kind `python` runs such a file on a worker. Outside of a farm, `report` prints, and
@@ -184,7 +184,8 @@ def dataset(name: str | None = None, **options: Any) -> Any:
 
     Args:
         name: The folder of the stage's `source`; may be left out.
-        options: As for `picofarm.open`: `split`, `arrays`, `crop`, …
+        options: As for `picofarm.open`: `split`, `arrays`, `crop`, … A side of a split
+            (`split="train"`) is that of the stage's `python.split`.
     """
     inputs: dict[str, Any] = (_TASK or {}).get("inputs") or {}
     if not inputs:
@@ -198,8 +199,14 @@ def dataset(name: str | None = None, **options: Any) -> Any:
     if not hasattr(picofarm, "open"):
         raise ImportError("dataset: needs picofarm in the worker's Python; install its wheel there")
     place = inputs[name]
-    if "split" in options and "split_name" not in options and place.get("split"):
+    if "split" in options and "split_name" not in options:
+        if not place["split"]:
+            what = "name the split as python.split, so that the job pins it"
+            raise ValueError(f"dataset: split = {options['split']!r}: {what}")
         options["split_name"] = place["split"]
+        options.setdefault("split_version", place["split_version"])
+    elif "scenes" not in options:
+        options["scenes"] = place["scenes"]
     return picofarm.open(place["url"], **options)
 
 

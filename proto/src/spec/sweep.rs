@@ -19,9 +19,11 @@
 //!
 //! `values = [{ lr = 0.01, width = 8, levels = 3 }, …]` lists the values of the first trials by
 //! hand. `trials` includes them, and the trials beyond are drawn. `picofarm sweep extend` writes
-//! such a list. Own trainings (`kind = "python"`) are swept in the same way. The sweep's id depends on the training, `over`, `seed` and `stop`. It does not
+//! such a list. The sweep's id depends on the training, `over`, `seed` and `stop`. It does not
 //! depend on the number of trials or on the origin of their values, so that an extended sweep stays
 //! the same, and its trials are compared with the earlier ones.
+//!
+//! Own trainings (`kind = "python"`) are swept in the same way.
 //!
 //! [`super::stop`] defines when inferior trials stop. No trial waits for another, and a stopped
 //! trial leaves its worker to the next. The set of trials that run to the end therefore depends on

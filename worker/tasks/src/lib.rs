@@ -8,7 +8,8 @@
 //!
 //! The modules form layers. Each module imports only modules of layers below its own, and a kind of
 //! task imports no other kind. From the top: `run`, `executor`, `kinds`, `repair`, `making`,
-//! `input`, `python`, `trial`, `device`, `task`, `interpreter`, `saver`, `stores`, `submission`, `memory`, `errors`.
+//! `input`, `python`, `trial`, `device`, `task`, `interpreter`, `saver`, `stores`, `submission`,
+//! `memory`, `errors`.
 
 #[cfg(feature = "networks")]
 mod device;

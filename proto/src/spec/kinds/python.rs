@@ -66,7 +66,7 @@ pub struct PythonSettings {
     /// The store of the model, for a stage without `source`.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub store: String,
-    /// The split of the data set that `run.dataset(split = …)` uses; empty means `default`.
+    /// The split of the data set whose sides the code may open, as `run.dataset(split = "train")`.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub split: String,
     /// Values for the code, by name: `run.parameters`.

@@ -1,8 +1,8 @@
 //! Own training: runs the job's Python code in a process of its own and publishes what it leaves.
 //!
 //! Like a training of the farm's networks, it may run for days on several workers in turn: it
-//! resumes from its newest checkpoint, and a sweep may stop it. Unlike there, nothing promises equal
-//! bytes: another run of equal code adopts the model that was published first.
+//! resumes from its newest checkpoint, and a sweep may stop it. Unlike there, nothing promises
+//! equal bytes: another run of equal code adopts the model that was published first.
 
 mod code;
 mod inputs;

@@ -1,8 +1,9 @@
 //! Runs Python code for a task: a process of its own, which reports to the worker and asks whether
 //! it must stop.
 //!
-//! The process gets a scratch folder with `task.json`, the code and a Unix socket. It sends one JSON
-//! object a line and gets one as an answer ([`message`]). Its output becomes log lines of the task.
+//! The process gets a scratch folder with `task.json`, the code and a Unix socket. It sends one
+//! JSON object a line and gets one as an answer ([`message`]). Its output becomes log lines of the
+//! task.
 //! The worker brings both sides of the conversation along: `_runner.py` and `run.py` are part of
 //! this program, so that they fit whichever picofarm the interpreter has installed, or none.
 //!
