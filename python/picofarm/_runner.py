@@ -190,7 +190,7 @@ def _work(folder: str) -> int:
     if unmet:
         print("requirements: " + "; ".join(unmet), file=sys.stderr)
         return UNMET
-    sys.path[0] = os.path.join(folder, "code")
+    sys.path[:] = [os.path.join(folder, "code"), *(p for p in sys.path if p != folder)]
     os.chdir(os.path.join(folder, "work"))
     sys.argv = [task["entry"]]
     run = _load_run(folder)

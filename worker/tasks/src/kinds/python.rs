@@ -151,7 +151,6 @@ impl OwnTraining<'_> {
         recorder.last();
         match ran? {
             Ended::Stopped => Ok(Finished::Left(recorder.ended()?)),
-            Ended::Done { .. } if recorder.has_diverged() => Ok(Finished::Left(recorder.ended()?)),
             Ended::Done { result, facts } => {
                 let new = results::model(self.task, &self.inputs, recorder, (result, facts))?;
                 let publish = async || self.models.publish(new.clone(), false).await;

@@ -1,12 +1,14 @@
 //! The socket of a Python process, and threads that read from it and from the process's output.
 
 use std::{
+    collections::BTreeMap,
     io::{BufRead, BufReader, ErrorKind, Read, Write},
     net::Shutdown,
     os::unix::net::{UnixListener, UnixStream},
     path::Path,
     sync::mpsc::SyncSender,
     thread,
+    time::Duration,
 };
 
 use serde_json::Value;
@@ -18,11 +20,16 @@ const CONNECTIONS: usize = 64;
 /// Most bytes of a line of output; the rest is left out.
 const OUTPUT_LINE: usize = 4096;
 
+/// How long an answer may wait for a process that does not read.
+const ANSWER_WITHIN: Duration = Duration::from_secs(30);
+
 /// What the threads hear.
 #[derive(Debug)]
 pub(super) enum Event {
     /// A line on a connection.
     Message(usize, Vec<u8>),
+    /// A connection has ended.
+    Closed(usize),
     /// A message is too long.
     Flood,
     /// A line of output.
@@ -34,7 +41,9 @@ pub(super) enum Event {
 /// The socket and its connections.
 pub(super) struct Channel {
     listener: UnixListener,
-    connections: Vec<UnixStream>,
+    connections: BTreeMap<usize, UnixStream>,
+    /// Number of connections so far.
+    begun: usize,
     sender: SyncSender<Event>,
 }
 
@@ -45,7 +54,8 @@ impl Channel {
         listener.set_nonblocking(true)?;
         Ok(Self {
             listener,
-            connections: Vec::new(),
+            connections: BTreeMap::new(),
+            begun: 0,
             sender,
         })
     }
@@ -63,25 +73,37 @@ impl Channel {
                 continue;
             }
             stream.set_nonblocking(false)?;
+            stream.set_write_timeout(Some(ANSWER_WITHIN))?;
             let (reader, sender) = (stream.try_clone()?, self.sender.clone());
-            let number = self.connections.len();
-            self.connections.push(stream);
+            let number = self.begun;
+            self.begun += 1;
+            self.connections.insert(number, stream);
             thread::Builder::new()
                 .name("python-socket".into())
                 .spawn(move || read_messages(reader, number, &sender))?;
         }
     }
 
-    /// Answers on a connection. A process that has ended hears nothing.
+    /// Answers on a connection. One that does not take the answer is closed.
     pub(super) fn answer(&mut self, number: usize, answer: &Value) {
         let text = format!("{answer}\n");
-        // The end of the process is noticed elsewhere.
-        let _ = self.connections[number].write_all(text.as_bytes());
+        let stream = self.connections.get_mut(&number);
+        if stream.is_some_and(|stream| stream.write_all(text.as_bytes()).is_err()) {
+            self.forget(number);
+        }
+    }
+
+    /// Closes a connection.
+    pub(super) fn forget(&mut self, number: usize) {
+        if let Some(stream) = self.connections.remove(&number) {
+            // It may be closed already.
+            let _ = stream.shutdown(Shutdown::Both);
+        }
     }
 
     /// Closes all connections. The supervisor then ends the task's processes.
     pub(super) fn close(&mut self) {
-        for stream in &self.connections {
+        for stream in self.connections.values() {
             // It may be closed already.
             let _ = stream.shutdown(Shutdown::Both);
         }
@@ -94,6 +116,7 @@ impl Drop for Channel {
     }
 }
 
+/// Sends each line of a connection, and then its end.
 fn read_messages(stream: UnixStream, number: usize, sender: &SyncSender<Event>) {
     let mut reader = BufReader::new(stream);
     loop {
@@ -103,13 +126,13 @@ fn read_messages(stream: UnixStream, number: usize, sender: &SyncSender<Event>) 
             .take(MESSAGE_BYTES)
             .read_until(b'\n', &mut line);
         let event = match read {
-            Ok(0) | Err(_) => return,
             Ok(_) if line.last() == Some(&b'\n') => Event::Message(number, line),
             Ok(n) if n as u64 == MESSAGE_BYTES => Event::Flood,
-            // Half a message, after which the process ended.
-            Ok(_) => return,
+            // Also half a message, after which the process ended.
+            Ok(_) | Err(_) => Event::Closed(number),
         };
-        if sender.send(event).is_err() {
+        let goes_on = matches!(event, Event::Message(..));
+        if sender.send(event).is_err() || !goes_on {
             return;
         }
     }

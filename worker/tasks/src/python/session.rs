@@ -29,6 +29,8 @@ const LAST_OUTPUT: Duration = Duration::from_secs(2);
 const WAITING: usize = 64;
 /// Exit status of a task whose requirements are not installed, from `_runner.py`.
 const UNMET: i32 = 78;
+/// The reason for a stop that was given before.
+const PRUNED: &str = "pruned";
 /// The reason for a stop that the worker wants.
 const WORKER_STOPS: &str = "worker stops";
 
@@ -94,7 +96,9 @@ impl Session<'_> {
         };
         loop {
             self.channel.accept().map_err(lost)?;
-            self.hurry()?;
+            if let Some(ended) = self.hurry()? {
+                return Ok(ended);
+            }
             match self.heard.recv_timeout(LOOK) {
                 Ok(event) => self.hear(event)?,
                 Err(RecvTimeoutError::Timeout) => {}
@@ -106,10 +110,10 @@ impl Session<'_> {
         }
     }
 
-    /// Ends a process that does not follow the request to stop.
-    fn hurry(&mut self) -> Result<(), TaskError> {
-        if !self.control.stopped() {
-            return Ok(());
+    /// Ends a process that does not follow the request to stop. Returns its end if it is over.
+    fn hurry(&mut self) -> Result<Option<Ended>, TaskError> {
+        if !self.control.stopped() && !self.pruned {
+            return Ok(None);
         }
         if self.control.unwanted() {
             return Err(TaskError::Stopped);
@@ -118,15 +122,18 @@ impl Session<'_> {
         match self.terminated {
             Some(at) if at.elapsed() >= self.patience.terminate => {
                 info!("the code did not end; its process is killed");
-                Err(TaskError::Stopped)
+                match self.pruned {
+                    true => Ok(Some(Ended::Stopped)),
+                    false => Err(TaskError::Stopped),
+                }
             }
             None if since.elapsed() >= self.patience.stop => {
                 info!("the code did not end within {:?}", self.patience.stop);
                 self.process.terminate();
                 self.terminated = Some(Instant::now());
-                Ok(())
+                Ok(None)
             }
-            _ => Ok(()),
+            _ => Ok(None),
         }
     }
 
@@ -136,6 +143,7 @@ impl Session<'_> {
                 info!("{}", show::line(line.trim_end()));
                 self.process.said(&line);
             }
+            Event::Closed(number) => self.channel.forget(number),
             Event::OutputEnded => self.outputs = self.outputs.saturating_sub(1),
             Event::Flood => {
                 let most = message::MESSAGE_BYTES >> 20;
@@ -161,6 +169,9 @@ impl Session<'_> {
         match message {
             Message::Report(report) => {
                 report.check().map_err(TaskError::User)?;
+                if self.pruned {
+                    return Ok(json!({"stop": PRUNED}));
+                }
                 if let Answer::Stop(why) = self.host.report(report)? {
                     self.pruned = true;
                     return Ok(json!({"stop": why}));
@@ -236,8 +247,10 @@ impl Session<'_> {
                 Err(RecvTimeoutError::Disconnected) => break,
             }
         }
+        if self.pruned {
+            return Ok(Ended::Stopped);
+        }
         match self.done.take() {
-            Some(_) if self.pruned => Ok(Ended::Stopped),
             Some(Done {
                 stopped: Some(_), ..
             }) => Err(TaskError::Stopped),

@@ -126,11 +126,6 @@ impl<'a> Recorder<'a> {
         self.saver.last();
     }
 
-    /// Returns whether the objective is not finite, which ends a trial.
-    pub(super) fn has_diverged(&self) -> bool {
-        matches!(self.end, Some(TrialEnd::Diverged(_)))
-    }
-
     /// Returns the figures of a trial that ended before its training.
     pub(super) fn ended(self) -> Result<EndedTrial, TaskError> {
         let end = self.end.ok_or_else(|| {
