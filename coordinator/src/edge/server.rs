@@ -25,7 +25,7 @@ use super::{
 };
 use crate::{
     actor::{Actor, Lanes, forget},
-    auth::{Access, Gate, METHODS, Quotas, TokenError},
+    auth::{Access, Gate, METHODS, OwnCode, Quotas, TokenError},
     core::{Backoff, Clock, Settings},
     memory::{Memory, MemoryBounds},
     observe::{
