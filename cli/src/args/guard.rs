@@ -45,6 +45,11 @@ pub struct Guard {
     /// Maximum number of active jobs of one caller
     #[arg(long, value_name = "N", default_value_t = 1_000, value_parser = super::ranges::at_least_one)]
     pub max_jobs_per_user: usize,
+    /// Maximum number of cores that the jobs of one caller use at a time, counting whole workers;
+    /// `max_cores` of a caller in the token file goes before it. Each coordinator counts its own
+    /// workers [default: any number]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub max_cores_per_user: Option<u32>,
     /// Maximum priority, above or below 0, without the role of an administrator
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub max_priority: u32,
@@ -100,6 +105,10 @@ pub enum Token {
         /// 2027-03-01T08:00:00Z [default: never]
         #[arg(long, value_name = "TIME", value_parser = expiry)]
         expires: Option<Expiry>,
+        /// Maximum number of cores that its jobs use at a time, instead of the coordinator's
+        /// --max-cores-per-user [default: that one]
+        #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+        max_cores: Option<u32>,
         #[command(flatten)]
         file: TokenFile,
     },

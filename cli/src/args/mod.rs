@@ -2,6 +2,7 @@
 
 mod autoalloc;
 mod capture;
+mod catalog;
 mod data;
 mod dataset;
 mod demultiplex;
@@ -30,6 +31,7 @@ use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use autoalloc::{Autoalloc, HAND_OVER, PoolArgs};
 pub use capture::{Capture, CaptureImport, CaptureResample};
+pub use catalog::{Catalog, Usage};
 pub use data::{
     DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit, PresetArg,
     SensorArgs,
@@ -239,6 +241,12 @@ pub enum Command {
     /// Show the audit log, for administrators: who submitted, stopped, paused, retried or drained
     /// what
     Audit(Audit),
+    /// Show what jobs consumed: core hours, tasks, failed attempts and bytes written. A result
+    /// counts once, for the job under which it was computed. Jobs without a `project` share a row
+    Usage(Usage),
+    /// Back up and restore a coordinator's catalog
+    #[command(subcommand)]
+    Catalog(Catalog),
     /// Install and list furniture for generated rooms
     #[command(subcommand)]
     Assets(Assets),

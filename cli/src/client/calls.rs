@@ -7,7 +7,7 @@ use picofarm_proto::{
     ids::JobId,
     messages::{
         AuditEntry, ConnectedWorker, Event, JobPlan, JobState, JobStatus, JobSummary, Reason,
-        TaskExplanation,
+        TaskExplanation, UsageBy, UsageRow,
     },
     spec::JobSpec,
     wire,
@@ -266,6 +266,21 @@ impl Client {
         let entries = call!(self, ANSWER, list_audit, request).entries;
         let entries = entries.into_iter().map(TryInto::try_into);
         entries.collect::<Result<_, _>>().map_err(unreadable)
+    }
+
+    /// Returns what jobs consumed from one day (since 1970-01-01, UTC) until before another.
+    pub async fn usage(
+        &mut self,
+        by: UsageBy,
+        (since_day, until_day): (i64, i64),
+    ) -> Result<Vec<UsageRow>> {
+        let request = wire::GetUsageRequest {
+            by: by.name().to_owned(),
+            since_day,
+            until_day,
+        };
+        let rows = call!(self, ANSWER, get_usage, request).rows;
+        Ok(rows.into_iter().map(Into::into).collect())
     }
 
     /// Returns the workers connected to the coordinator that answers.

@@ -81,6 +81,9 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         stores::identify(spec, identity, output).await;
     }
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
+    if let Some(spec) = &mut spec {
+        name_former_jobs(spec, &mut client).await?;
+    }
     match command {
         Job::Init { .. } | Job::Check { .. } => Ok(()),
         Job::Plan { .. } => {
@@ -328,4 +331,16 @@ async fn history(client: &mut Client, page: Page) -> Result<Vec<Event>> {
         events.drain(..surplus);
     }
     Ok(events)
+}
+
+/// Replaces the numbers and names of the jobs in `after` by their ids.
+async fn name_former_jobs(spec: &mut JobSpec, client: &mut Client) -> Result<()> {
+    for name in &mut spec.after {
+        let found = client.find(name).await.map_err(|e| CliError {
+            message: format!("after: {}", e.message),
+            ..e
+        });
+        *name = found?.to_string();
+    }
+    Ok(())
 }

@@ -4,6 +4,7 @@ mod assets;
 mod audit;
 mod autoalloc;
 mod capture;
+mod catalog;
 mod certificates;
 mod completions;
 mod config;
@@ -26,6 +27,7 @@ mod scene;
 mod sweep;
 mod token;
 mod up;
+mod usage;
 #[cfg(feature = "web")]
 mod web;
 mod worker;
@@ -75,6 +77,8 @@ pub(crate) async fn run(command: Command, resolved: &Resolved, output: Output) -
         Command::Figure(args) => figure::run(args, output).await,
         Command::Token(command) => token::run(command, resolved, output).await,
         Command::Certificates(args) => certificates::run(&args, output),
+        Command::Usage(args) => usage::run(&args, settings, output).await,
+        Command::Catalog(command) => catalog::run(command, output).await,
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,
         Command::Config => {

@@ -38,10 +38,12 @@ pub async fn run(command: Token, resolved: &Resolved, output: Output) -> Result<
             member,
             maintainer,
             expires,
+            max_cores,
             file,
         } => {
             let projects = (member, maintainer);
-            create(&name, role.into(), projects, expires, &file.tokens, output)
+            let limits = (expires, max_cores);
+            create(&name, role.into(), projects, limits, &file.tokens, output)
         }
         Token::List { file } => {
             list(&file.tokens, output)?;
@@ -55,13 +57,15 @@ fn create(
     name: &str,
     roles: Roles,
     (member, maintainer): (Vec<String>, Vec<String>),
-    expires: Option<Expiry>,
+    (expires, max_cores): (Option<Expiry>, Option<u32>),
     path: &Path,
     output: Output,
 ) -> Result<()> {
     let said = roles.to_string();
     let token = Tokens::edit_or_create(path, |tokens| {
-        tokens.create_until(name, roles, member, maintainer, expires)
+        let token = tokens.create_until(name, roles, member, maintainer, expires)?;
+        tokens.bound_cores(name, max_cores)?;
+        Ok(token)
     })
     .map_err(unusable)?;
     let until = expires.map_or_else(String::new, |expires| format!(", until {expires}"));
@@ -71,7 +75,7 @@ fn create(
     ));
     output.result(
         &json!({"name": name, "roles": said.split(',').collect::<Vec<_>>(), "expires": expires,
-            "token": token.expose()}),
+            "max_cores": max_cores, "token": token.expose()}),
         || token.expose().to_owned(),
     );
     if let Err(unprinted) = printed() {
@@ -103,7 +107,7 @@ fn list(path: &Path, output: Output) -> Result<()> {
         .map(|e| {
             json!({"name": e.name, "roles": e.roles, "certificate": e.certificate,
                 "expires": e.expires, "expired": e.expires.is_some_and(|t| t.is_over(now)),
-                "member": e.member, "maintainer": e.maintainer})
+                "member": e.member, "maintainer": e.maintainer, "max_cores": e.max_cores})
         })
         .collect();
     output.result(&callers, || {
@@ -119,6 +123,8 @@ fn list(path: &Path, output: Output) -> Result<()> {
                     e.roles.to_string(),
                     proof(&e.certificate),
                     until(e.expires),
+                    e.max_cores
+                        .map_or_else(String::new, |n| format!("{n} cores")),
                     projects.join(", "),
                 ]
             })

@@ -172,6 +172,7 @@ mod tests {
                 limits: Limits::default(),
                 nonce: String::new(),
                 project: String::new(),
+                after: Vec::new(),
                 stages: Vec::new(),
             },
             mean_task_seconds: None,

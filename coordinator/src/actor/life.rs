@@ -29,7 +29,7 @@ use super::{
     slow_work::SlowWork,
 };
 use crate::{
-    core::{Clock, Core, NewJob, Reported, Settings, Timings},
+    core::{Clock, Core, CoreQuotas, NewJob, Reported, Settings, Timings},
     memory::{Memory, kept_cost},
     observe::{
         health::Health,
@@ -63,6 +63,8 @@ pub(crate) struct Actor {
     pub health: Arc<Health>,
     pub stop: CancellationToken,
     pub memory: Arc<Memory>,
+    /// Returns the current bounds on the cores of users.
+    pub quotas: Box<dyn Fn() -> CoreQuotas + Send + Sync>,
     pub slow_work: Arc<dyn SlowWork>,
 }
 
@@ -127,13 +129,14 @@ impl Actor {
             ranges = snapshot.owned.ranges.len(), "an instance begins");
         let jobs = snapshot.jobs.iter();
         let kept = jobs.map(|job| (job.id, kept_cost(&job.spec))).collect();
-        let core = Core::load(
+        let mut core = Core::load(
             snapshot,
             &timings,
             self.settings,
             Box::new(Uuid::now_v7),
             self.clock.now_ms(),
         );
+        core.set_quotas((self.quotas)());
         let life = Life {
             actor: self,
             core,
@@ -270,6 +273,7 @@ impl Life<'_> {
         let connected = self.core.connected();
         let news = self.actor.catalog.beat(connected, self.now()).await?;
         self.actor.health.beat();
+        self.core.set_quotas((self.actor.quotas)());
         let now = self.now();
         let unknown = self.core.apply_news(news, now);
         self.kept.retain(|job, _| self.core.knows(*job));

@@ -1,6 +1,7 @@
 //! Identifies callers by their credentials, and reads the token file again after each change.
 
 use std::{
+    collections::BTreeMap,
     path::PathBuf,
     sync::Arc,
     time::{Duration, Instant, SystemTime},
@@ -75,6 +76,14 @@ impl Gate {
             None => RequiredCredentials::Nothing,
         };
         Ok((Self { required, trust }, judge))
+    }
+
+    /// Returns the callers with a bound of their own on the cores that their jobs use.
+    pub(crate) fn core_quotas(&self) -> BTreeMap<String, u32> {
+        let trust = self.trust.borrow();
+        let entries = trust.tokens.entries().iter();
+        let bounded = entries.filter_map(|e| Some((e.name.clone(), e.max_cores?)));
+        bounded.collect()
     }
 
     /// Identifies the caller, on a connection that began when the client certificate authorities

@@ -15,6 +15,8 @@ use tonic::Status;
 pub struct Quotas {
     /// Unfinished jobs of one caller.
     pub jobs_per_user: usize,
+    /// Cores that the jobs of one caller use at a time; `None` for no bound.
+    pub cores_per_user: Option<u32>,
     /// Tasks of one job.
     pub tasks_per_job: u64,
     /// Concurrent worker sessions.
@@ -25,11 +27,12 @@ pub struct Quotas {
 }
 
 impl Default for Quotas {
-    /// Returns 1,000 jobs a caller, 10,000,000 tasks a job, 10,000 workers, priorities from -100 to
-    /// 100.
+    /// Returns 1,000 jobs a caller, any number of cores, 10,000,000 tasks a job, 10,000 workers,
+    /// and priorities from -100 to 100.
     fn default() -> Self {
         Self {
             jobs_per_user: 1_000,
+            cores_per_user: None,
             tasks_per_job: 10_000_000,
             sessions: 10_000,
             max_priority: 100,

@@ -177,6 +177,7 @@ mod tests {
                 sha256: None,
                 certificate: Some("c".into()),
                 expires: None,
+                max_cores: None,
                 member: texts(member),
                 maintainer: texts(maintainer),
             })),

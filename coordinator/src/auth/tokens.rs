@@ -53,12 +53,26 @@ pub struct Entry {
     /// The time at which access ends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expires: Option<Expiry>,
+    /// The most cores that the caller's jobs use at a time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_cores: Option<u32>,
     /// Projects that the caller may name in its jobs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub member: Vec<String>,
     /// Projects in which the caller may change all jobs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub maintainer: Vec<String>,
+}
+
+impl Entry {
+    /// Returns whether both give the same access. A bound on cores is none.
+    pub(super) fn gives_access_of(&self, other: &Self) -> bool {
+        let bounded = Self {
+            max_cores: other.max_cores,
+            ..self.clone()
+        };
+        bounded == *other
+    }
 }
 
 /// The content of the token file.
@@ -74,6 +88,7 @@ const HEAD: &str = "\
 # Roles: view, submit, work, admin. sha256 is that of the token, which is kept nowhere.
 # member = [\"PROJECT\"] lets a caller name the project in its jobs; maintainer = [\"PROJECT\"] lets it change all jobs of it.
 # In place of sha256, certificate = \"NAME\" knows a client certificate by its common name or an alternative name.
+# max_cores = 64 bounds the cores that a caller's jobs use at a time.
 # expires = \"2027-03-01T08:00:00Z\" ends a caller's access at that time.
 
 ";
@@ -143,6 +158,11 @@ impl Tokens {
             if entry.roles.is_empty() {
                 return Err(format!(
                     "{at} has no roles; give it view, submit, work or admin"
+                ));
+            }
+            if entry.max_cores == Some(0) {
+                return Err(format!(
+                    "{at}: max_cores must be at least 1; leave it out for no bound"
                 ));
             }
             for project in entry.member.iter().chain(&entry.maintainer) {
@@ -275,10 +295,22 @@ impl Tokens {
             sha256: Some(hex::encode(Sha256::digest(&token))),
             certificate: None,
             expires,
+            max_cores: None,
             member,
             maintainer,
         });
         Ok(Secret::new(token))
+    }
+
+    /// Bounds the cores that a caller's jobs use at a time; `None` removes the bound.
+    ///
+    /// # Errors
+    /// Returns a message if no caller has this name.
+    pub fn bound_cores(&mut self, name: &str, most: Option<u32>) -> Result<(), String> {
+        let entry = self.entries.iter_mut().find(|e| e.name == name);
+        let entry = entry.ok_or_else(|| format!("there is no caller {name:?}"))?;
+        entry.max_cores = most;
+        Ok(())
     }
 
     /// Removes a caller. Returns `false` if no caller has this name.

@@ -75,16 +75,19 @@ impl Trust {
         Ok(())
     }
 
+    fn knows(&self, entry: &Entry) -> bool {
+        let now = self.tokens.by_name(&entry.name);
+        now.is_some_and(|now| now.gives_access_of(entry))
+    }
+
     /// Refuses a caller with a removed or changed entry.
     pub(super) fn judge(&self, entry: Option<&Entry>, authorities: u64) -> Result<(), Status> {
         self.judge_connection(authorities)?;
         match entry {
-            Some(entry) if !self.tokens.entries().contains(entry) => {
-                Err(Status::unauthenticated(format!(
-                    "the token of {:?} was revoked or its roles were changed",
-                    entry.name
-                )))
-            }
+            Some(entry) if !self.knows(entry) => Err(Status::unauthenticated(format!(
+                "the token of {:?} was revoked or its roles were changed",
+                entry.name
+            ))),
             _ => Ok(()),
         }
     }

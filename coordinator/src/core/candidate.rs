@@ -5,6 +5,8 @@
 pub enum NotEligible {
     /// Their store cannot be used now.
     Store(String),
+    /// The jobs of the user use as many cores as they may.
+    Quota(String),
     /// Anything else.
     Otherwise(String),
 }
@@ -13,7 +15,7 @@ impl NotEligible {
     /// The words.
     pub fn words(&self) -> &str {
         match self {
-            Self::Store(words) | Self::Otherwise(words) => words,
+            Self::Store(words) | Self::Quota(words) | Self::Otherwise(words) => words,
         }
     }
 }

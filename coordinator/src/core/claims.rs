@@ -1,7 +1,7 @@
 //! Connects the catalog to the workers: claims pending tasks, gives back unwanted ones, and applies
 //! news of other instances.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use picofarm_catalog::{Changes, Claim, News, Owned, Range, RangeState, Want};
 use picofarm_proto::{
@@ -77,6 +77,8 @@ impl Core {
                 || joined.is_none_or(|all| {
                     all.contains(&worker.id) || (all.len() as u64) < self.load.room(job.id, most)
                 });
+            let bounded = self.has_quota(&job.user);
+            let room = room && (!bounded || self.quota_left(&job.user, worker.id, &asking.cores));
             if worker.credits == 0 || !room || self.may_run(id, worker.id, now_ms).is_err() {
                 demand.next += 1;
                 continue;
@@ -104,12 +106,27 @@ impl Core {
             demand.suspects |= worker.empty_handed;
             worker.credits -= 1;
             asking.credits -= 1;
+            if bounded && !self.load.works_for(&job.user, worker.id) {
+                let cores = self.load.cores_of(worker.id);
+                let taken = asking.cores.entry(job.user.clone()).or_default();
+                taken.insert(worker.id, cores);
+            }
             if joins {
                 asking.joined.entry(job.id).or_default().insert(worker.id);
             }
             return true;
         }
         false
+    }
+
+    /// Returns whether a worker may get a lease of a user's job, with those that are about to.
+    fn quota_left(&self, user: &str, worker: WorkerId, joining: &JoiningCores) -> bool {
+        let joining = joining.get(user);
+        if joining.is_some_and(|workers| workers.contains_key(&worker)) {
+            return true;
+        }
+        let more = joining.map_or(0, |workers| workers.values().sum());
+        self.within_quota(user, worker, more).is_ok()
     }
 
     fn supply(&self, id: StageRef, now_ms: i64) -> Supply {
@@ -312,7 +329,12 @@ struct AskingWorkers {
     credits: u64,
     /// Workers that would join the workers of a job with a limit.
     joined: HashMap<JobId, BTreeSet<WorkerId>>,
+    /// Workers that would join those of users with a bound.
+    cores: JoiningCores,
 }
+
+/// Cores of workers, by user.
+type JoiningCores = HashMap<String, BTreeMap<WorkerId, u64>>;
 
 struct AskingWorker {
     id: WorkerId,
@@ -329,6 +351,7 @@ impl AskingWorkers {
             credits: workers.iter().map(|w| u64::from(w.credits)).sum(),
             workers,
             joined: HashMap::new(),
+            cores: HashMap::new(),
         }
     }
 }

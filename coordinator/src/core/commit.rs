@@ -208,6 +208,9 @@ impl Core {
             EventKind::Reused
         } else {
             self.stages.add_time(set, report.seconds, report.bytes);
+            if let Some(worker) = worker {
+                self.count_task(id, worker, report, now_ms);
+            }
             EventKind::Committed
         };
         let about = EventDetails::default()

@@ -122,6 +122,9 @@ impl Core {
         if let Err(why) = entry.suits(&shape.abilities) {
             return Some(why);
         }
+        if let Err(why) = self.room_for(&entry.job().user, shape.abilities.cores) {
+            return Some(why);
+        }
         // A store that is unavailable to all is unavailable to a worker that nobody knows.
         let unknown = WorkerId::from_uuid(Uuid::nil());
         let store = store_of(&entry.spec().task);

@@ -123,6 +123,9 @@ impl Core {
                 "it failed, or gave back, one lease after another; one task is trying it now",
             ));
         }
+        let user = &self.stages[&id].job().user;
+        self.within_quota(user, worker, 0)
+            .map_err(NotEligible::Quota)?;
         match self.passed_over(id, worker, now_ms) {
             Some(0) => Err(
                 "tasks of the stage failed on it one after another; one task is trying it now"

@@ -10,7 +10,9 @@ use picofarm_proto::ids::{JobId, RangeId, WorkerId};
 pub(super) struct Load {
     leases: HashMap<RangeId, (JobId, WorkerId)>,
     jobs: HashMap<JobId, JobLoad>,
-    users: HashMap<String, u32>,
+    users: HashMap<String, UserLoad>,
+    /// Cores of the workers that were connected in this life.
+    cores: HashMap<WorkerId, u64>,
     /// Number of leases that began.
     turn: u64,
     /// The turn at which each active job, and each user, got the last lease or joined.
@@ -18,6 +20,14 @@ pub(super) struct Load {
     turns_of_users: HashMap<String, u64>,
     /// Workers of other instances by job, as last reported.
     elsewhere: BTreeMap<JobId, u32>,
+}
+
+#[derive(Debug, Default)]
+struct UserLoad {
+    leases: u32,
+    workers: BTreeMap<WorkerId, u32>,
+    /// The sum over these workers.
+    cores: u64,
 }
 
 #[derive(Debug, Default)]
@@ -37,7 +47,11 @@ impl Load {
         load.user.clone_from(&job.user);
         load.leases += 1;
         *load.workers.entry(worker).or_default() += 1;
-        *self.users.entry(job.user.clone()).or_default() += 1;
+        let cores = self.cores_of(worker);
+        self.users
+            .entry(job.user.clone())
+            .or_default()
+            .begin(worker, cores);
         self.turn += 1;
         self.turns_of_jobs.insert(job.id, self.turn);
         self.turns_of_users.insert(job.user.clone(), self.turn);
@@ -78,14 +92,42 @@ impl Load {
         if *count == 0 {
             load.workers.remove(&worker);
         }
+        let cores = self.cores.get(&worker).copied().unwrap_or(1);
         let user = self.users.get_mut(&load.user).expect("counted as well");
-        *user -= 1;
-        if *user == 0 {
+        user.end(worker, cores);
+        if user.leases == 0 {
             self.users.remove(&load.user);
         }
         if load.leases == 0 {
             self.jobs.remove(&job);
         }
+    }
+
+    /// Records the cores of a worker that connects.
+    pub(super) fn worker_has(&mut self, worker: WorkerId, cores: u32) {
+        let cores = u64::from(cores.max(1));
+        let before = self.cores.insert(worker, cores).unwrap_or(1);
+        for user in self.users.values_mut() {
+            if user.workers.contains_key(&worker) {
+                user.cores = user.cores - before + cores;
+            }
+        }
+    }
+
+    /// Returns the cores of a worker; 1 if they are unknown.
+    pub(super) fn cores_of(&self, worker: WorkerId) -> u64 {
+        self.cores.get(&worker).copied().unwrap_or(1)
+    }
+
+    /// Returns the cores of the workers with leases of a user's jobs.
+    pub(super) fn cores_of_user(&self, user: &str) -> u64 {
+        self.users.get(user).map_or(0, |load| load.cores)
+    }
+
+    /// Returns whether a worker has leases of a user's jobs.
+    pub(super) fn works_for(&self, user: &str, worker: WorkerId) -> bool {
+        let load = self.users.get(user);
+        load.is_some_and(|load| load.workers.contains_key(&worker))
     }
 
     /// Records the workers of other instances, by job.
@@ -95,7 +137,7 @@ impl Load {
 
     /// Returns the number of leases of a user's jobs.
     pub(super) fn leases_of_user(&self, user: &str) -> u32 {
-        self.users.get(user).copied().unwrap_or(0)
+        self.users.get(user).map_or(0, |load| load.leases)
     }
 
     /// Returns the number of leases of a job.
@@ -120,6 +162,28 @@ impl Load {
     /// instances are up to a second old, so that the limit can be exceeded for as long.
     pub(super) fn may_join(&self, job: JobId, worker: WorkerId, most: u32) -> bool {
         self.works(job, worker) || self.room(job, most) > 0
+    }
+}
+
+impl UserLoad {
+    fn begin(&mut self, worker: WorkerId, cores: u64) {
+        self.leases += 1;
+        let count = self.workers.entry(worker).or_default();
+        *count += 1;
+        if *count == 1 {
+            self.cores += cores;
+        }
+    }
+
+    fn end(&mut self, worker: WorkerId, cores: u64) {
+        self.leases -= 1;
+        let count = self.workers.get_mut(&worker);
+        let count = count.expect("counted when it began");
+        *count -= 1;
+        if *count == 0 {
+            self.workers.remove(&worker);
+            self.cores -= cores;
+        }
     }
 }
 
@@ -152,8 +216,15 @@ mod tests {
         let lease = RangeId::from_uuid(Uuid::from_u128(2));
         let worker = |n| WorkerId::from_uuid(Uuid::from_u128(n));
         let mut load = Load::default();
+        load.worker_has(worker(3), 8);
         load.lease_begun(lease, &job, worker(3));
+        assert_eq!(load.cores_of_user("ada"), 8);
         load.lease_begun(lease, &job, worker(4));
+        assert_eq!(load.cores_of_user("ada"), 1, "it is not connected yet");
+        load.worker_has(worker(4), 16);
+        load.worker_has(worker(4), 4);
+        assert_eq!(load.cores_of_user("ada"), 4);
+        assert!(load.works_for("ada", worker(4)) && !load.works_for("ada", worker(3)));
         assert_eq!((load.leases_of_job(id), load.leases_of_user("ada")), (1, 1));
         assert!(load.may_join(id, worker(4), 1) && !load.may_join(id, worker(3), 1));
         load.lease_over(lease);

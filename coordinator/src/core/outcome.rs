@@ -5,8 +5,8 @@ use std::collections::HashMap;
 
 use picofarm_catalog::{Changes, Exception, NewEvent, Output, Range, Worker};
 use picofarm_proto::{
-    ids::{LeaseRef, RangeId, StageRef},
-    messages::EventKind,
+    ids::{JobId, LeaseRef, RangeId, StageRef},
+    messages::{EventKind, Usage},
 };
 
 use super::{
@@ -123,6 +123,11 @@ impl Outcome {
     pub(super) fn record_exception(&mut self, exception: Exception) {
         let key = (exception.stage, exception.task);
         self.changes.exceptions.insert(key, exception);
+    }
+
+    /// Adds what a task of a job consumed.
+    pub(super) fn record_usage(&mut self, day: i64, job: JobId, usage: Usage) {
+        *self.changes.usage.entry((day, job)).or_default() += usage;
     }
 
     /// Adds the record of a worker.

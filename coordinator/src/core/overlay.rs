@@ -76,6 +76,7 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
             limits: job.spec.limits.clone(),
             nonce: job.spec.nonce.clone(),
             project: job.spec.project.clone(),
+            after: job.spec.after.clone(),
             // Lists of files may be long, so they are left out.
             stages: job.spec.stages.iter().map(|s| s.only(0, 0)).collect(),
         },

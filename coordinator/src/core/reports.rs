@@ -25,6 +25,9 @@ impl Core {
             .held_to_do(session, failure.lease, failure.index, now_ms)
             .cloned();
         let verdict = held.map(|range| {
+            if let Some(worker) = self.workers.id_of(session) {
+                self.count_failure(range.stage, worker, failure, now_ms);
+            }
             self.leave(
                 &range,
                 failure.index,

@@ -47,6 +47,7 @@ impl Core {
         for range in &former {
             self.lost(range, &why, now_ms);
         }
+        self.load.worker_has(id, hello.abilities.cores);
         self.workers.connect(
             id,
             WorkerEntry {

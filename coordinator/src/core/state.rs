@@ -17,6 +17,7 @@ use super::{
     outcome::Outcome,
     peers::Peers,
     pools::Pools,
+    quota::CoreQuotas,
     refunds::Refunds,
     second_runs::SecondRuns,
     settings::{MakeId, Settings},
@@ -36,6 +37,8 @@ pub(crate) struct Core {
     pub(super) leases: Leases,
     /// Which workers run which job.
     pub(super) load: Load,
+    /// The most cores that each user's jobs use.
+    pub(super) quotas: CoreQuotas,
     /// Tasks that run a second time.
     pub(super) second_runs: SecondRuns,
     /// Unavailable stores for which tasks wait.
@@ -72,6 +75,7 @@ impl Core {
             workers: Workers::with_names(names),
             leases: Leases::default(),
             load: Load::default(),
+            quotas: CoreQuotas::default(),
             second_runs: SecondRuns::default(),
             store_faults: StoreFaults::default(),
             doubts: Doubts::default(),

@@ -245,6 +245,8 @@ fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
             index: lease.lo,
             kind: FailureKind::Interrupted,
             message: "no".into(),
+            milliseconds: 0,
+            shared: 0,
         };
         world.instances[1].core.failed(session, &failure, world.now);
         world.act(&Op::Release(0, 0)).await;

@@ -26,7 +26,7 @@ use super::{
 use crate::{
     actor::{Actor, Lanes, forget},
     auth::{Access, Gate, METHODS, OwnCode, Quotas, TokenError},
-    core::{Backoff, Clock, Settings},
+    core::{Backoff, Clock, CoreQuotas, Settings},
     memory::{Memory, MemoryBounds},
     observe::{
         audit::Audit,
@@ -284,6 +284,13 @@ async fn start(
         health: Arc::clone(&health),
         stop: shutdown.clone(),
         memory: Arc::clone(&memory),
+        quotas: {
+            let (gate, every) = (gate.clone(), config.quotas.cores_per_user);
+            Box::new(move || CoreQuotas {
+                every,
+                of: gate.core_quotas(),
+            })
+        },
         slow_work: Arc::new(submissions.clone()),
     };
     let link = Link {

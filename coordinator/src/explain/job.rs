@@ -9,22 +9,12 @@ use picofarm_proto::{
     },
 };
 
-use super::facts::JobFacts;
+use super::{
+    facts::JobFacts,
+    reason::{n, reason},
+    waits::{over_quota, short_of_time, waits_for_jobs},
+};
 use crate::core::{Candidate, NotEligible, span};
-
-fn reason(code: &str, tasks: u64, words: String) -> Reason {
-    Reason {
-        code: code.into(),
-        tasks,
-        words,
-        until_ms: None,
-    }
-}
-
-/// Formats a count: "1 task", "3 tasks".
-fn n(count: u64, what: &str) -> String {
-    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
-}
 
 /// Returns why a job's tasks do not run, most important reason first. Never empty.
 pub fn job(facts: &JobFacts) -> Vec<Reason> {
@@ -122,6 +112,7 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
         waiting,
         next_ms,
         failed,
+        after,
     } = &facts.holdups;
     if facts.paused {
         let words = format!(
@@ -130,6 +121,10 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
             facts.job
         );
         reasons.push(reason("paused", facts.counts.pending, words));
+        return;
+    }
+    if !after.is_empty() {
+        reasons.push(waits_for_jobs(facts, after));
         return;
     }
     let shared = facts.shared.min(*ready);
@@ -256,6 +251,9 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     if let Some(reason) = short_of_time(facts, ready, &able) {
         return reason;
     }
+    if let Some(reason) = over_quota(facts, ready, &able) {
+        return reason;
+    }
     if able.is_empty() {
         let (small, others_say): (Vec<&Candidate>, Vec<&Candidate>) = facts
             .candidates
@@ -360,21 +358,6 @@ fn starters(facts: &JobFacts) -> String {
     });
     let cannot: Vec<String> = cannot.collect();
     format!("start one with `picofarm worker`{}", cannot.concat())
-}
-
-/// Explains the case in which every able worker ends too early.
-fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Reason> {
-    if able.iter().any(|c| c.lacks_time.is_none()) {
-        return None;
-    }
-    let needs = facts.candidates.iter().filter_map(|c| c.lacks_time).min()?;
-    let words = format!(
-        "no connected worker has {} left for {}: a task is taken to need that long, by those that are done and the attempts that \
-         were interrupted; start a worker that may run longer, or divide the scenes (`parts` of a render stage)",
-        span(needs),
-        n(ready, "task")
-    );
-    Some(reason("time", ready, words))
 }
 
 /// Describes what happened to the leases of recently connected workers.

@@ -2,9 +2,11 @@
 
 mod facts;
 mod job;
+mod reason;
 mod task;
 #[cfg(test)]
 mod tests;
+mod waits;
 
 pub(crate) use facts::{JobFacts, TaskFacts};
 pub(crate) use job::job;

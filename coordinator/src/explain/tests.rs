@@ -2,6 +2,7 @@
 
 mod job;
 mod task;
+mod waits;
 
 use picofarm_catalog::{Exception, Holdups};
 use picofarm_proto::{

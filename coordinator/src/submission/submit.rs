@@ -29,7 +29,22 @@ impl Submissions {
     /// Returns what submitting the draft would do.
     pub(crate) async fn plan(&self, draft: &Arc<Draft>, by: &Caller) -> Result<JobPlan, Refusal> {
         self.in_time(draft)?;
+        self.after_known_jobs(draft, by).await?;
         Ok(self.consider(draft, by).await?.plan)
+    }
+
+    /// Refuses a job that waits for one that does not exist, or that the caller may not see.
+    async fn after_known_jobs(&self, draft: &Draft, by: &Caller) -> Result<Vec<JobId>, Refusal> {
+        let after = draft.spec.after_jobs().map_err(Refusal::Spec)?;
+        let sight = by.sight(self.visibility);
+        for job in &after {
+            let owner = self.catalog.owner(*job).await.map_err(broken)?;
+            if !owner.is_some_and(|owner| sight.sees(&owner)) {
+                let what = format!("there is no job {job}; see `picofarm job list`");
+                return Err(Refusal::Spec(SpecError::new("after", what)));
+            }
+        }
+        Ok(after)
     }
 
     /// Refuses a deadline that has passed, because the job would be cancelled at once.
@@ -56,6 +71,7 @@ impl Submissions {
     ) -> Result<Submitted, Refusal> {
         self.in_time(draft)?;
         for _ in 0..ATTEMPTS {
+            let after = self.after_known_jobs(draft, by).await?;
             let considered = self.consider(draft, by).await?;
             let latest = considered.latest.as_ref();
             let stands = latest.filter(|job| !considered.lost && reuses_job(job.state, again));
@@ -72,7 +88,7 @@ impl Submissions {
             {
                 return Err(Refusal::Denied(not_owner(&job.id, &job.owner)));
             }
-            if let Some(submitted) = self.record(draft, by, most, considered).await? {
+            if let Some(submitted) = self.record(draft, by, most, (considered, after)).await? {
                 return Ok(submitted);
             }
         }
@@ -88,7 +104,7 @@ impl Submissions {
         draft: &Arc<Draft>,
         by: &Caller,
         most: u64,
-        considered: Considered,
+        (considered, after): (Considered, Vec<JobId>),
     ) -> Result<Option<Submitted>, Refusal> {
         let (plan, owner) = (considered.plan, by.name.to_string());
         let circle = self.visibility.circle(by, &draft.spec);
@@ -119,7 +135,7 @@ impl Submissions {
                 false => places::written(&draft.spec.stages, &prepared.stages, &owner),
             };
             let places: Vec<OwnedPlace> = places.into_iter().map(|(_, place)| place).collect();
-            it.commit(prepared, &gone, instead_of, (&places, &permitted)).await
+            it.commit(prepared, (&gone, &after), instead_of, (&places, &permitted)).await
         });
         let Some(job) = recorded.await? else {
             return Ok(None);
@@ -134,7 +150,7 @@ impl Submissions {
     async fn commit(
         &self,
         prepared: Prepared,
-        gone: &[Gone],
+        (gone, after): (&[Gone], &[JobId]),
         instead_of: Option<JobId>,
         (places, permitted): (&[OwnedPlace], &[String]),
     ) -> Result<Option<JobId>, Refusal> {
@@ -146,6 +162,7 @@ impl Submissions {
         } = prepared;
         let submission = Submission {
             gone,
+            after,
             instead_of,
             places,
             permitted,

@@ -271,6 +271,7 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
                     seconds,
                     adopted,
                     traceparent,
+                    shared: 0,
                 })
             },
         );
@@ -282,6 +283,8 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
                 kind,
                 message,
                 damaged: index % 2 == 0,
+                milliseconds: index,
+                shared: u32::MAX,
             })
         });
     let release = (lease(), ".{0,20}")

@@ -5,6 +5,7 @@ mod explain;
 mod job;
 mod session;
 mod status;
+mod usage;
 
 use std::str::FromStr;
 

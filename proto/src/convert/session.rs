@@ -212,6 +212,7 @@ impl TryFrom<wire::TaskDone> for Finished {
                 Ok(()) => w.traceparent,
                 Err(_) => String::new(),
             },
+            shared: w.shared,
         })
     }
 }
@@ -227,6 +228,7 @@ impl From<Finished> for wire::TaskDone {
             seconds: m.seconds,
             adopted: m.adopted,
             traceparent: m.traceparent,
+            shared: m.shared,
         }
     }
 }
@@ -252,6 +254,12 @@ impl TryFrom<wire::TaskFailed> for Failure {
             index: w.index,
             kind,
             message: bounds::message(&w.message),
+            milliseconds: {
+                let seconds = bounds::seconds(w.milliseconds as f64 / 1000.0);
+                checked(seconds, "failed.milliseconds")?;
+                w.milliseconds
+            },
+            shared: w.shared,
         })
     }
 }
@@ -271,6 +279,8 @@ impl From<Failure> for wire::TaskFailed {
             // A longer text than allowed would end the session each time it is sent.
             message: bounds::message(&m.message),
             damaged: m.kind == FailureKind::Damaged,
+            milliseconds: m.milliseconds,
+            shared: m.shared,
         }
     }
 }

@@ -743,6 +743,9 @@ pub struct TaskDone {
     /// Where the task was in a trace (W3C Trace Context); empty = nowhere.
     #[prost(string, tag = "8")]
     pub traceparent: ::prost::alloc::string::String,
+    /// Tasks that shared the worker's cores when this one ended, this one included; 0 = not known, as one.
+    #[prost(uint32, tag = "9")]
+    pub shared: u32,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct TaskFailed {
@@ -757,6 +760,12 @@ pub struct TaskFailed {
     /// With FAILURE_KIND_STORE: the store answers, but an object in it is damaged. Only the task waits.
     #[prost(bool, tag = "5")]
     pub damaged: bool,
+    /// How long the attempt took; 0 = not known.
+    #[prost(uint64, tag = "6")]
+    pub milliseconds: u64,
+    /// As in TaskDone.
+    #[prost(uint32, tag = "7")]
+    pub shared: u32,
 }
 /// Answers TaskDone, TaskFailed and Release.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1191,6 +1200,41 @@ pub mod farm_server {
     impl<T> tonic::server::NamedService for FarmServer<T> {
         const NAME: &'static str = SERVICE_NAME;
     }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetUsageRequest {
+    /// user, project, day
+    #[prost(string, tag = "1")]
+    pub by: ::prost::alloc::string::String,
+    /// Days since 1970-01-01 (UTC), the first included, the last not; 0 as the last = no end.
+    #[prost(int64, tag = "2")]
+    pub since_day: i64,
+    #[prost(int64, tag = "3")]
+    pub until_day: i64,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetUsageResponse {
+    /// By name.
+    #[prost(message, repeated, tag = "1")]
+    pub rows: ::prost::alloc::vec::Vec<UsageRow>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct UsageRow {
+    /// The user, the project (empty = none), or the number of the day.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// Tasks that were computed; results that were found are not among them.
+    #[prost(uint64, tag = "2")]
+    pub tasks: u64,
+    /// Failed attempts, without those that were interrupted.
+    #[prost(uint64, tag = "3")]
+    pub failures: u64,
+    /// Milliseconds of tasks and failed attempts, times the cores that each used.
+    #[prost(uint64, tag = "4")]
+    pub core_ms: u64,
+    /// Published by those tasks.
+    #[prost(uint64, tag = "5")]
+    pub bytes: u64,
 }
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoRequest {}
@@ -1926,6 +1970,30 @@ pub mod jobs_client {
                 .insert(GrpcMethod::new("picofarm.v1.Jobs", "ListAudit"));
             self.inner.unary(req, path, codec).await
         }
+        /// What the jobs that the caller may see consumed, by user, project or day.
+        pub async fn get_usage(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetUsageRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetUsageResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::SmallCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/picofarm.v1.Jobs/GetUsage",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Jobs", "GetUsage"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -2065,6 +2133,14 @@ pub mod jobs_server {
             request: tonic::Request<super::ListAuditRequest>,
         ) -> std::result::Result<
             tonic::Response<super::ListAuditResponse>,
+            tonic::Status,
+        >;
+        /// What the jobs that the caller may see consumed, by user, project or day.
+        async fn get_usage(
+            &self,
+            request: tonic::Request<super::GetUsageRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetUsageResponse>,
             tonic::Status,
         >;
     }
@@ -2865,6 +2941,49 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ListAuditSvc(inner);
+                        let codec = crate::codec::SmallCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/picofarm.v1.Jobs/GetUsage" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetUsageSvc<T: Jobs>(pub Arc<T>);
+                    impl<T: Jobs> tonic::server::UnaryService<super::GetUsageRequest>
+                    for GetUsageSvc<T> {
+                        type Response = super::GetUsageResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetUsageRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Jobs>::get_usage(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetUsageSvc(inner);
                         let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -94,6 +94,8 @@ pub struct Finished {
     pub adopted: bool,
     /// Trace context of the task; see [`crate::trace`].
     pub traceparent: String,
+    /// Number of tasks that shared the worker's cores at its end, itself included; 0 if unknown.
+    pub shared: u32,
 }
 
 /// The cause of a failure. Each has its own budget.
@@ -123,6 +125,10 @@ pub struct Failure {
     pub kind: FailureKind,
     /// Description of the failure.
     pub message: String,
+    /// Duration of the attempt in milliseconds; 0 if unknown.
+    pub milliseconds: u64,
+    /// Number of tasks that shared the worker's cores, itself included; 0 if unknown.
+    pub shared: u32,
 }
 
 /// Progress of a running task.

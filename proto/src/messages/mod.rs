@@ -5,6 +5,7 @@ pub mod explain;
 pub mod lease;
 pub mod log;
 pub mod status;
+pub mod usage;
 
 pub use audit::{Act, AuditEntry, Outcome};
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
@@ -16,3 +17,4 @@ pub use status::{
     Estimate, Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan,
     StageState, StageStatus, TaskCounts,
 };
+pub use usage::{Usage, UsageBy, UsageRow};

@@ -31,6 +31,26 @@ use super::{
     sweep,
 };
 
+/// The number, the name or the id of another job.
+#[derive(Deserialize)]
+#[serde(
+    untagged,
+    expecting = "expected the number, the name or the id of a job"
+)]
+pub(super) enum JobName {
+    Number(u64),
+    Text(String),
+}
+
+impl From<JobName> for String {
+    fn from(name: JobName) -> Self {
+        match name {
+            JobName::Number(number) => number.to_string(),
+            JobName::Text(text) => text,
+        }
+    }
+}
+
 /// A job file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -44,6 +64,8 @@ pub(super) struct JobText {
     pub(super) nonce: String,
     #[serde(default)]
     pub(super) project: String,
+    #[serde(default)]
+    pub(super) after: Vec<JobName>,
     #[serde(default)]
     resources: Resources,
     scenes: Option<SceneSource>,

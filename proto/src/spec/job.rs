@@ -4,11 +4,15 @@
 
 use serde::{Deserialize, Serialize};
 
+use std::collections::BTreeSet;
+
+use crate::ids::JobId;
+
 use super::{
     RenderTask, TaskSpec,
     bounds::{NAME_BYTES, cut},
     file::JobText,
-    limits::{Limits, MAX_STAGES, MAX_TASKS, check_project},
+    limits::{Limits, MAX_AFTER, MAX_STAGES, MAX_TASKS, check_project},
     refer,
     spec_error::SpecError,
     stage::StageSpec,
@@ -32,6 +36,10 @@ pub struct JobSpec {
     /// Project of the job; its maintainers may change the job. Empty means none.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub project: String,
+    /// Jobs that must be done before any task of this job begins: in a job file their numbers,
+    /// names or ids, after a submission their ids.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub after: Vec<String>,
     /// Stages, each after the stages that it needs.
     #[serde(rename = "stage")]
     pub stages: Vec<StageSpec>,
@@ -48,6 +56,7 @@ impl TryFrom<JobText> for JobSpec {
             limits: text.limits,
             nonce: text.nonce,
             project: text.project,
+            after: text.after.into_iter().map(Into::into).collect(),
         };
         spec.resolve()?;
         Ok(spec)
@@ -63,6 +72,7 @@ impl JobSpec {
             limits: Limits::default(),
             nonce: String::new(),
             project: String::new(),
+            after: Vec::new(),
             stages: vec![StageSpec::new(TaskSpec::Render(task))],
         }
     }
@@ -88,6 +98,10 @@ impl JobSpec {
         self.limits.check()?;
         if !self.project.is_empty() {
             check_project(&self.project).map_err(|what| SpecError::new("project", what))?;
+        }
+        if self.after.len() > MAX_AFTER {
+            let what = format!("names {} jobs, at most {MAX_AFTER}", self.after.len());
+            return Err(SpecError::new("after", what));
         }
         if self.stages.is_empty() || self.stages.len() > MAX_STAGES {
             let what = format!(
@@ -122,6 +136,21 @@ impl JobSpec {
         let mut stages = self.stages.iter();
         stages.try_for_each(|stage| stage.check_resolved().map_err(|e| self.at(stage, e)))?;
         self.check_places()
+    }
+
+    /// Returns the ids of the jobs that must be done before this one begins, each once.
+    ///
+    /// # Errors
+    /// Returns a [`SpecError`] for a text that is not an id.
+    pub fn after_jobs(&self) -> Result<Vec<JobId>, SpecError> {
+        let ids = self.after.iter().map(|text| {
+            text.parse().map_err(|_| {
+                let what = format!("{text:?} is not the id of a job; a submission needs ids");
+                SpecError::new("after", what)
+            })
+        });
+        let ids: BTreeSet<JobId> = ids.collect::<Result<_, _>>()?;
+        Ok(ids.into_iter().collect())
     }
 
     /// Checks the places of a submitted job: absolute paths or URLs without `..`. Job files may

@@ -11,6 +11,8 @@ use super::{
 pub const MAX_TASKS: u64 = 100_000_000;
 /// Default of `max_interruptions`.
 const MAX_INTERRUPTIONS: u32 = 20;
+/// Most jobs that one job waits for.
+pub(super) const MAX_AFTER: usize = 64;
 /// Most stages in one job.
 pub const MAX_STAGES: usize = 1_000;
 

@@ -9,6 +9,7 @@ use crate::{
     instance::Worker,
     range::Range,
     task::{Exception, Output},
+    usage::NewUsage,
 };
 
 /// The writes of one commit. If a range, exception or worker changes several times, only the last
@@ -32,6 +33,8 @@ pub struct Changes {
     pub exceptions: BTreeMap<(StageRef, u64), Exception>,
     /// Current state of the workers.
     pub workers: BTreeMap<WorkerId, Worker>,
+    /// What the tasks consumed.
+    pub usage: NewUsage,
     /// New history events, in order.
     pub events: Vec<NewEvent>,
     /// Stages in which this instance has no ranges left, with the Unix time in milliseconds. If no

@@ -92,7 +92,7 @@ pub struct Claim {
 /// State that an instance polls from the catalog.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct News {
-    /// The active jobs, and whether each is paused.
+    /// The active jobs, and whether each is paused or waits for another job's end.
     pub active: BTreeMap<JobId, bool>,
     /// Number of workers with leases from other instances, by job.
     pub busy: BTreeMap<JobId, u32>,

@@ -162,4 +162,17 @@ pub struct Holdups {
     pub next_ms: Option<i64>,
     /// A few of the tasks that failed most often.
     pub failed: Vec<Exception>,
+    /// The jobs that must be done before any task begins, and are not.
+    pub after: Vec<FormerJob>,
+}
+
+/// A job that another one waits for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FormerJob {
+    /// Its id.
+    pub job: JobId,
+    /// Its number in lists.
+    pub number: u64,
+    /// Its state.
+    pub state: JobState,
 }

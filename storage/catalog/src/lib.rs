@@ -27,26 +27,28 @@ mod refused;
 mod rights;
 mod submission;
 mod task;
+mod usage;
 
 use std::{fmt, sync::Arc};
 
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{JobId, StageRef, WorkerId},
-    messages::{Event, JobState, TaskCounts},
+    messages::{Event, JobState, TaskCounts, UsageRow},
 };
 
 pub use changes::Changes;
 pub use error::CatalogError;
 pub use event::{EventQuery, NewEvent};
 pub use instance::{Claim, Free, JobEnd, News, Owned, Settled, Snapshot, Want, Worker};
-pub use job::{Holdups, Job, JobRecord, ResultSet, StageCounts, StageRecord, Timing};
+pub use job::{FormerJob, Holdups, Job, JobRecord, ResultSet, StageCounts, StageRecord, Timing};
 pub use listing::{Forgotten, JobQuery, Page};
 pub use range::{LeaseState, Mark, Range, RangeState, Run};
 pub use refused::{Culprit, Row, culprits, verdict};
 pub use rights::{AuditQuery, NewAudit, OwnedPlace, Owner, Rights, Sight};
 pub use submission::{Gone, Outcome, Recorded, Submission};
 pub use task::{Exception, Output, TaskRecord};
+pub use usage::{NewUsage, UsageQuery, day_of};
 
 /// The location of a catalog that can be opened. Its text never shows a password.
 #[async_trait]
@@ -242,6 +244,9 @@ pub trait Catalog: Rights {
 
     /// Returns the record of one task.
     async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError>;
+
+    /// Returns what jobs consumed, by the name of what it is summed by.
+    async fn usage(&self, query: &UsageQuery) -> Result<Vec<UsageRow>, CatalogError>;
 
     /// Returns history events, oldest first.
     async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError>;

@@ -18,6 +18,8 @@ pub struct Submission<'a> {
     pub events: &'a [NewEvent],
     /// Recorded outputs that the store does not have; their records are deleted.
     pub gone: &'a [Gone],
+    /// The jobs that must be done before this one begins.
+    pub after: &'a [JobId],
     /// A done job with the same spec and lost results, which this job replaces.
     pub instead_of: Option<JobId>,
     /// The places that the job writes into and that its submitter will own.
@@ -40,6 +42,7 @@ impl<'a> Submission<'a> {
             ranges,
             events,
             gone: &[],
+            after: &[],
             instead_of: None,
             places: &[],
             permitted: &[],

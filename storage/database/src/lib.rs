@@ -14,6 +14,7 @@ mod sql_jobs;
 mod sql_listing;
 mod sql_rights;
 mod sql_stages;
+mod sql_usage;
 mod sqlite;
 #[cfg(feature = "testing")]
 pub mod testing;
@@ -21,4 +22,4 @@ pub mod testing;
 pub use place::CatalogPlace;
 #[cfg(feature = "postgres")]
 pub use postgres::PostgresCatalog;
-pub use sqlite::SqliteCatalog;
+pub use sqlite::{Backup, BackupError, SqliteCatalog, backup, restore};

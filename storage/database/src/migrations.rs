@@ -32,6 +32,8 @@ const SQLITE_STEPS: &[Step] = steps!("sqlite":
     5 "0005_places",
     6 "0006_unchecked",
     8 "0008_interruptions",
+    9 "0009_usage",
+    10 "0010_after",
 );
 #[cfg(feature = "postgres")]
 const POSTGRES_STEPS: &[Step] = steps!("postgres":
@@ -42,6 +44,8 @@ const POSTGRES_STEPS: &[Step] = steps!("postgres":
     5 "0005_places",
     6 "0006_unchecked",
     8 "0008_interruptions",
+    9 "0009_usage",
+    10 "0010_after",
 );
 
 /// The migrations for SQLite.

@@ -15,6 +15,15 @@ macro_rules! at {
 }
 pub(crate) use at;
 
+/// The condition that no task of a job may begin: it is paused, or a job before it is not done.
+macro_rules! held {
+    () => {
+        "(job.paused OR EXISTS (SELECT 1 FROM job_after JOIN job AS former ON former.key = job_after.needs \
+           WHERE job_after.job = job.key AND former.state <> 1))"
+    };
+}
+pub(crate) use held;
+
 macro_rules! job_queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod job_query {
@@ -25,8 +34,8 @@ macro_rules! job_queries {
 
             use super::query::{exception, stage_of, uint};
             use super::stage_query::{final_stages, nodes};
-            use picofarm_catalog::{Free, Holdups, Job, JobRecord, ResultSet, Timing, Sight, Specs};
-            use crate::{seen::seen, sql::{self, bad}, sql_jobs::at};
+            use picofarm_catalog::{FormerJob, Free, Holdups, Job, JobRecord, ResultSet, Timing, Sight, Specs};
+            use crate::{seen::seen, sql::{self, bad}, sql_jobs::{at, held}};
 
             type Connection = $connection;
             type DbRow = $row;
@@ -54,9 +63,9 @@ macro_rules! job_queries {
                 rows.iter().map(job).collect()
             }
 
-            /// Returns the active jobs, and whether each is paused.
+            /// Returns the active jobs, and whether each is paused or waits for another job.
             pub(crate) async fn active(c: &mut Connection) -> Result<BTreeMap<JobId, bool>> {
-                let rows = sqlx::query("SELECT id, paused FROM job WHERE state = 0")
+                let rows = sqlx::query(concat!("SELECT id, ", held!(), " AS paused FROM job WHERE state = 0"))
                     .fetch_all(c)
                     .await?;
                 rows.iter()
@@ -305,6 +314,51 @@ macro_rules! job_queries {
                 rows.iter().map(job).collect()
             }
 
+            /// Returns whether all of these jobs exist.
+            pub(crate) async fn exist(c: &mut Connection, jobs: &[JobId]) -> Result<bool> {
+                for job in jobs {
+                    if state(&mut *c, *job).await?.is_none() {
+                        return Ok(false);
+                    }
+                }
+                Ok(true)
+            }
+
+            /// Records that a job begins when others are done.
+            pub(crate) async fn begin_after(c: &mut Connection, key: i64, after: &[JobId]) -> Result<()> {
+                for former in after {
+                    sqlx::query(
+                        "INSERT INTO job_after (job, needs) SELECT $1, key FROM job WHERE id = $2 ON CONFLICT DO NOTHING",
+                    )
+                    .bind(key)
+                    .bind(former.uuid())
+                    .execute(&mut *c)
+                    .await?;
+                }
+                Ok(())
+            }
+
+            /// Returns the jobs that must be done before this one begins, and are not.
+            async fn formers(c: &mut Connection, job: JobId) -> Result<Vec<FormerJob>> {
+                let rows = sqlx::query(
+                    "SELECT former.id, former.key, former.state FROM job_after JOIN job ON job.key = job_after.job \
+                     JOIN job AS former ON former.key = job_after.needs \
+                     WHERE job.id = $1 AND former.state <> 1 ORDER BY former.key",
+                )
+                .bind(job.uuid())
+                .fetch_all(c)
+                .await?;
+                rows.iter()
+                    .map(|row| {
+                        Ok(FormerJob {
+                            job: JobId::from_uuid(row.try_get("id")?),
+                            number: uint(row, "key")?,
+                            state: sql::job_state(row.try_get("state")?)?,
+                        })
+                    })
+                    .collect()
+            }
+
             pub(crate) async fn holdups(c: &mut Connection, job: JobId, now_ms: i64) -> Result<Holdups> {
                 let row = sqlx::query(
                     "SELECT \
@@ -324,9 +378,10 @@ macro_rules! job_queries {
                      WHERE job.id = $1 ORDER BY dead DESC, failures + crashes + interruptions DESC, task LIMIT 5",
                 )
                 .bind(job.uuid())
-                .fetch_all(c)
+                .fetch_all(&mut *c)
                 .await?;
                 Ok(Holdups {
+                    after: formers(c, job).await?,
                     ready: uint(&row, "ready")?,
                     waiting: uint(&row, "waiting")?,
                     next_ms: row.try_get("next_ms")?,

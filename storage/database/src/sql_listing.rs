@@ -196,7 +196,10 @@ macro_rules! listing_queries {
             /// because other writers wait.
             pub(crate) async fn forget(c: &mut Connection, before_ms: i64) -> Result<Forgotten> {
                 let keys: Vec<i64> = sqlx::query_scalar(
-                    "SELECT key FROM job WHERE state <> 0 AND ended_ms < $1 ORDER BY ended_ms LIMIT $2",
+                    // A job that an active one waits for stays.
+                    "SELECT key FROM job WHERE state <> 0 AND ended_ms < $1 AND NOT EXISTS \
+                       (SELECT 1 FROM job_after JOIN job AS later ON later.key = job_after.job \
+                        WHERE job_after.needs = job.key AND later.state = 0) ORDER BY ended_ms LIMIT $2",
                 )
                 .bind(before_ms)
                 .bind(crate::listing::JOBS)
@@ -233,7 +236,12 @@ macro_rules! listing_queries {
                         return Ok(Forgotten { jobs: 0, more: true });
                     }
                 }
-                for before in ["DELETE FROM stage WHERE job IN (", "DELETE FROM job WHERE key IN ("] {
+                for before in [
+                    "DELETE FROM job_after WHERE job IN (",
+                    "DELETE FROM job_after WHERE needs IN (",
+                    "DELETE FROM stage WHERE job IN (",
+                    "DELETE FROM job WHERE key IN (",
+                ] {
                     of_jobs(before, &keys, ")").build().execute(&mut *c).await?;
                 }
                 Ok(Forgotten {

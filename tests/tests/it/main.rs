@@ -4,6 +4,7 @@
 mod arrays;
 mod attack;
 mod autoalloc;
+mod backups;
 mod bad_input;
 mod calibrated;
 mod chaos;

@@ -238,6 +238,7 @@ impl Assignments {
             .running
             .remove(at.expect("only a running task can end"));
         let held = self.leases.iter().any(|h| h.lease == hand.lease);
+        let shared = u32::try_from(self.running.len() + 1).unwrap_or(u32::MAX);
         if result.is_ok() {
             self.pace = Some((hand.task.stage, now - hand.since));
         }
@@ -251,6 +252,7 @@ impl Assignments {
                 seconds: (now - hand.since).as_secs_f64(),
                 adopted: output.adopted,
                 traceparent: hand.traceparent.clone(),
+                shared,
             })),
             Err(_) if !held => {}
             Err(TaskError::Stopped) => self.release(hand.lease, "the task was stopped half-way"),
@@ -265,6 +267,8 @@ impl Assignments {
                     TaskError::Damaged(_) => FailureKind::Damaged,
                 },
                 message: error.to_string(),
+                milliseconds: u64::try_from((now - hand.since).as_millis()).unwrap_or(0),
+                shared,
             })),
         }
         self.tidy();

@@ -105,6 +105,8 @@ mod tests {
             index,
             kind: FailureKind::User,
             message: String::new(),
+            milliseconds: 0,
+            shared: 0,
         })
     }
 

@@ -156,6 +156,10 @@ fn entries_that_make_no_sense_are_named() {
             "role",
         ),
         (
+            format!("name = \"a\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\nmax_cores = 0\n"),
+            "at least 1",
+        ),
+        (
             format!(
                 "name = \"a\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\nmember = [\"x y\"]\n"
             ),
@@ -171,4 +175,23 @@ fn entries_that_make_no_sense_are_named() {
             .unwrap_err()
             .contains("twice")
     );
+}
+
+#[test]
+fn a_bound_on_cores_is_kept_in_the_file_and_changes_no_access() {
+    let mut tokens = Tokens::default();
+    let roles = vec![Role::Submit].into();
+    tokens.create("ada", roles, vec![], vec![]).unwrap();
+    let before = tokens.entries()[0].clone();
+    tokens.bound_cores("ada", Some(64)).unwrap();
+    assert!(tokens.bound_cores("eve", Some(64)).is_err());
+    let read = Tokens::parse(&tokens.to_text()).unwrap();
+    let after = &read.entries()[0];
+    assert_eq!(after.max_cores, Some(64));
+    assert!(after.gives_access_of(&before));
+    let other = Entry {
+        member: vec!["light".into()],
+        ..before.clone()
+    };
+    assert!(!other.gives_access_of(&before));
 }

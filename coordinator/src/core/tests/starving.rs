@@ -9,6 +9,7 @@ use picofarm_proto::{
 use proptest::prelude::*;
 
 use super::{
+    super::CoreQuotas,
     block_on,
     world::{Op, World},
 };
@@ -113,11 +114,16 @@ proptest! {
     #[test]
     fn a_task_that_can_run_is_leased_whenever_a_worker_asks(
         jobs in prop::collection::vec((0..WAYS.len(), 0..2i32, any::<bool>()), 1..6),
+        quota in prop::option::of(1..4u32),
         ops in prop::collection::vec(ops(), 10..60),
     ) {
         block_on(async {
             let folder = tempfile::tempdir().unwrap();
             let mut world = World::on_sqlite(folder.path()).await;
+            world.instances[0].core.set_quotas(CoreQuotas {
+                every: quota,
+                ..CoreQuotas::default()
+            });
             for (n, (way, priority, other)) in jobs.iter().enumerate() {
                 let user = if *other { "eve" } else { "ada" };
                 let spec = job(&format!("j{n}"), *priority, WAYS[*way]);

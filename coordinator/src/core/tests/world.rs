@@ -360,6 +360,7 @@ impl World {
             seconds: 0.01,
             adopted: false,
             traceparent: String::new(),
+            shared: 0,
         };
         self.flush(h).await;
         let instance = &mut self.instances[h];
@@ -402,6 +403,8 @@ impl World {
             index,
             kind,
             message: "no".into(),
+            milliseconds: 0,
+            shared: 0,
         };
         self.instances[h].core.failed(session, &failure, self.now);
         self.flush(h).await;

@@ -19,7 +19,7 @@ use tonic::{Request, Response, Status};
 use super::{
     link::{Link, account, broken, caller, invalid, refused},
     look,
-    requests::{draft, filter, job_id, listing},
+    requests::{draft, filter, job_id, listing, usage},
     watch::watch_while_allowed,
 };
 use crate::{
@@ -395,6 +395,23 @@ impl Jobs for JobsService {
             .await?;
         let worker = worker.try_into().map_err(invalid)?;
         Ok(Response::new(look::demand(&self.link, &by, worker).await?))
+    }
+
+    async fn get_usage(
+        &self,
+        request: Request<wire::GetUsageRequest>,
+    ) -> Result<Response<wire::GetUsageResponse>, Status> {
+        let (by, account) = (caller(&request), account(&request));
+        let query = usage(&request.into_inner(), by.sight(self.link.visibility))?;
+        let charge = account.charge("the usage", LINE * u64::from(EVENTS));
+        let _charge = charge.await?;
+        let rows = self
+            .link
+            .read(move |catalog| async move { catalog.usage(&query).await })
+            .await?;
+        Ok(Response::new(wire::GetUsageResponse {
+            rows: rows.into_iter().map(Into::into).collect(),
+        }))
     }
 
     async fn list_audit(

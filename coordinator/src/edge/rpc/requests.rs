@@ -1,8 +1,9 @@
 //! Reads and checks the requests of clients.
 
-use picofarm_catalog::{JobQuery, Sight};
+use picofarm_catalog::{JobQuery, Sight, UsageQuery};
 use picofarm_proto::{
     ids::JobId,
+    messages::UsageBy,
     spec::{JobSpec, StageSpec, bounds},
     wire,
 };
@@ -74,6 +75,20 @@ pub(super) fn listing(
     })
 }
 
+/// Reads the query of the usage.
+pub(super) fn usage(request: &wire::GetUsageRequest, sight: Sight) -> Result<UsageQuery, Status> {
+    let by = UsageBy::named(&request.by);
+    Ok(UsageQuery {
+        by: by.ok_or_else(|| wrong("by", "expected user, project or day"))?,
+        since_day: request.since_day,
+        until_day: match request.until_day {
+            0 => i64::MAX,
+            day => day,
+        },
+        sight,
+    })
+}
+
 /// Reads and checks a spec.
 pub(super) fn draft(
     wire: wire::JobSpec,
@@ -84,6 +99,7 @@ pub(super) fn draft(
 ) -> Result<Draft, Status> {
     let spec = JobSpec::try_from(wire).map_err(invalid)?;
     spec.check_submitted().map_err(|e| invalid(e.into()))?;
+    spec.after_jobs().map_err(|e| invalid(e.into()))?;
     by.may_submit(&spec, quotas.max_priority)
         .map_err(|e| invalid(e.into()))?;
     own_code.check(&spec).map_err(|e| invalid(e.into()))?;

@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// Returns the first reason's code and words.
-fn first(facts: &JobFacts) -> (String, String) {
+pub(super) fn first(facts: &JobFacts) -> (String, String) {
     let reasons = job(facts);
     (reasons[0].code.clone(), reasons[0].words.clone())
 }

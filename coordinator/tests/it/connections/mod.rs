@@ -2,6 +2,7 @@
 //! certificates that change while it runs.
 
 mod memory;
+mod monitoring;
 mod pages;
 mod tls;
 

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::PATIENCE;
 
-async fn start(folder: &tempfile::TempDir) -> Running {
+pub(super) async fn start(folder: &tempfile::TempDir) -> Running {
     let any = "127.0.0.1:0".parse().unwrap();
     let mut config = CoordinatorConfig::new(
         CatalogPlace::from(folder.path().join("catalog.sqlite")),
@@ -32,7 +32,7 @@ async fn heard(stream: &mut TcpStream) -> String {
     String::from_utf8(bytes).unwrap()
 }
 
-async fn answer(to: &Running, request: impl AsRef<[u8]>) -> String {
+pub(super) async fn answer(to: &Running, request: impl AsRef<[u8]>) -> String {
     let mut stream = TcpStream::connect(to.http.unwrap()).await.unwrap();
     // The server may close before everything is written.
     let _ = stream.write_all(request.as_ref()).await;
@@ -51,7 +51,7 @@ fn header<'a>(answer: &'a str, name: &str) -> Option<&'a str> {
         .find_map(|(found, value)| found.eq_ignore_ascii_case(name).then_some(value))
 }
 
-fn body(answer: &str) -> &str {
+pub(super) fn body(answer: &str) -> &str {
     answer.split_once("\r\n\r\n").unwrap().1
 }
 

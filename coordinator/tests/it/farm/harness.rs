@@ -342,6 +342,8 @@ pub fn manifest(index: u64) -> String {
 
 pub struct Worker {
     pub hello: WorkerHello,
+    /// Number of tasks that share its cores, as it reports.
+    pub share: u32,
     say: mpsc::Sender<wire::SessionRequest>,
     heard: Streaming<wire::SessionResponse>,
 }
@@ -362,7 +364,12 @@ impl Worker {
             .session(ReceiverStream::new(said))
             .await?
             .into_inner();
-        let mut worker = Self { hello, say, heard };
+        let mut worker = Self {
+            hello,
+            share: 0,
+            say,
+            heard,
+        };
         match worker.hear().await? {
             Heard::Welcome(welcome) => assert_eq!(welcome.lease_ms, LEASE_MS),
             other => panic!("expected welcome, heard {other:?}"),
@@ -410,6 +417,7 @@ impl Worker {
             seconds: 2.0,
             adopted: false,
             traceparent: String::new(),
+            shared: self.share,
         };
         self.say(Say::Done(done)).await;
     }
@@ -430,6 +438,8 @@ impl Worker {
             kind: kind.into(),
             message: "no such mesh".into(),
             damaged: false,
+            milliseconds: 3_000,
+            shared: 0,
         }))
         .await;
         assert!(self.acknowledged().await.accepted);

@@ -128,6 +128,7 @@ async fn each_text_of_each_call_is_checked_before_the_catalog_sees_it() {
                     assert!(refused.message().len() < 5_000, "{call}");
                 }};
             }
+            refused!(get_usage, GetUsageRequest, by);
             refused!(list_audit, ListAuditRequest, who);
             refused!(list_audit, ListAuditRequest, job_id);
             refused!(list_events, ListEventsRequest, job_id);

@@ -10,4 +10,5 @@ mod poison;
 mod results;
 mod sharing;
 mod start;
+mod usage;
 mod verified;

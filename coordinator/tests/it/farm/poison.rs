@@ -31,6 +31,7 @@ fn report(lease: &Lease, index: u64) -> wire::TaskDone {
         seconds: 2.0,
         adopted: false,
         traceparent: String::new(),
+        shared: 0,
     }
 }
 
@@ -41,6 +42,8 @@ fn failure(lease: &Lease, index: u64, message: &str) -> Say {
         kind: wire::FailureKind::User.into(),
         message: message.into(),
         damaged: false,
+        milliseconds: 0,
+        shared: 0,
     })
 }
 

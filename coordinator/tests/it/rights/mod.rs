@@ -116,6 +116,13 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
                 worker: "nobody".into()
             }
         ),
+        "GetUsage" => code!(
+            get_usage,
+            wire::GetUsageRequest {
+                by: "user".into(),
+                ..Default::default()
+            }
+        ),
         "ListAudit" => code!(list_audit, wire::ListAuditRequest::default()),
         other => panic!("{other} is new: say here who may call it"),
     }

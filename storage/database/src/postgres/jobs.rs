@@ -66,6 +66,9 @@ pub(super) async fn record(
             .execute(&mut *writer.c)
             .await?;
     }
+    if !job_query::exist(&mut *writer.c, submission.after).await? {
+        return Ok(Outcome::Changed);
+    }
     let free =
         rights_query::free_places(&mut *writer.c, submission.places, submission.permitted).await?;
     let Some(free) = free else {
@@ -92,6 +95,7 @@ pub(super) async fn record(
     let Some(key) = key else {
         return Ok(Outcome::Exists);
     };
+    job_query::begin_after(&mut *writer.c, key, submission.after).await?;
     rights_query::take_places(&mut *writer.c, &free).await?;
     for gone in submission.gone {
         query::drop_output(&mut *writer.c, gone).await?;

@@ -23,7 +23,7 @@ use std::{sync::Mutex, time::Duration};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{InstanceId, JobId, StageRef, WorkerId},
-    messages::{Event, JobState, TaskCounts},
+    messages::{Event, JobState, TaskCounts, UsageRow},
 };
 use sqlx::{Connection, PgPool, postgres::PgRow};
 use uuid::Uuid;
@@ -31,7 +31,7 @@ use uuid::Uuid;
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Range, RangeState, Recorded, ResultSet, Run, Settled,
-    Sight, Snapshot, Specs, Submission, TaskRecord, Timing, Want,
+    Sight, Snapshot, Specs, Submission, TaskRecord, Timing, UsageQuery, Want,
 };
 
 use hints::Hints;
@@ -46,6 +46,7 @@ crate::sql_listing::listing_queries!(
 crate::sql_stages::stage_queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_rights::rights_queries!(sqlx::PgConnection, super::PgRow);
+crate::sql_usage::usage_queries!(sqlx::PgConnection, super::PgRow);
 
 /// Connections of one coordinator: one receives hints, two write, and the others read. Their number
 /// exceeds the coordinator's concurrent heavy reads.
@@ -359,6 +360,13 @@ impl Catalog for PostgresCatalog {
     async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError> {
         let mut c = self.reader().await?;
         query::task(&mut c, stage, task)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn usage(&self, query: &UsageQuery) -> Result<Vec<UsageRow>, CatalogError> {
+        let mut c = self.reader().await?;
+        usage_query::usage(&mut c, query)
             .await
             .map_err(|e| self.failed(e))
     }

@@ -7,21 +7,23 @@ use uuid::Uuid;
 use super::{
     job_query, jobs, query,
     rows::{give, insert_ranges, write_rows},
+    usage_query,
     writer::{RANGE, Result, WriteError, Writer},
 };
-use crate::sql::int;
+use crate::{sql::int, sql_jobs::held};
 
 /// The number of pending ranges examined for one request.
 const LOOK_AT: i64 = 256;
 pub(super) async fn claim(writer: &mut Writer<'_>, wants: &[Want]) -> Result<Vec<Claim>> {
     let mut claims = Vec::with_capacity(wants.len());
+    let held = held!();
     for want in wants {
         let key = writer.keys(want.stage).await?.stage;
         let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
             "SELECT {RANGE} FROM task_range WHERE stage = $1 AND state = 0 AND owner IS NULL AND not_before_ms <= $2 \
              AND ($4 OR crashes = 0) \
              AND EXISTS (SELECT 1 FROM job JOIN stage ON stage.job = job.key \
-               WHERE stage.key = $1 AND stage.state = 1 AND job.state = 0 AND NOT job.paused) \
+               WHERE stage.key = $1 AND stage.state = 1 AND job.state = 0 AND NOT {held}) \
              ORDER BY not_before_ms, lo LIMIT $3 FOR UPDATE SKIP LOCKED"
         )))
         .bind(key)
@@ -88,6 +90,10 @@ pub(super) async fn changes(writer: &mut Writer<'_>, changes: &Changes) -> Resul
         give(writer, key, range).await?;
     }
     write_rows(writer, changes).await?;
+    for ((day, job), usage) in &changes.usage {
+        let job = writer.job(*job).await?;
+        usage_query::add(writer.c, writer.instance, (*day, job), usage).await?;
+    }
     let mut settled = Settled::default();
     for (stage, at_ms) in &changes.perhaps_over {
         settled.join(jobs::stage_over(writer, *stage, *at_ms).await?);

@@ -59,6 +59,9 @@ pub(super) async fn record(
             return Ok(Outcome::Changed);
         }
     }
+    if !job_query::exist(&mut *c, submission.after).await? {
+        return Ok(Outcome::Changed);
+    }
     let free = rights_query::free_places(&mut *c, submission.places, submission.permitted).await?;
     let Some(free) = free else {
         return Ok(Outcome::Changed);
@@ -83,6 +86,7 @@ pub(super) async fn record(
     let Some(key) = key else {
         return Ok(Outcome::Exists);
     };
+    job_query::begin_after(&mut *c, key, submission.after).await?;
     rights_query::take_places(&mut *c, &free).await?;
     for gone in submission.gone {
         query::drop_output(&mut *c, gone).await?;

@@ -2,6 +2,7 @@
 //! transaction at a time. The coordinator's actor collects all changes that arrive in the meantime
 //! into the next transaction, so one fsync serves many messages. Reads have their own connections.
 
+mod backup;
 mod errors;
 mod files;
 mod jobs;
@@ -16,17 +17,18 @@ use std::{collections::BTreeMap, path::PathBuf};
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{InstanceId, JobId, StageRef, WorkerId},
-    messages::{Event, JobState, TaskCounts},
+    messages::{Event, JobState, TaskCounts, UsageRow},
 };
 use sqlx::{Connection, SqlitePool, sqlite::SqliteRow};
 use tokio::sync::Mutex;
 use uuid::Uuid;
 
 use crate::lock::CatalogLock;
+pub use backup::{Backup, BackupError, backup, restore};
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Recorded, ResultSet, Run, Settled, Sight, Snapshot,
-    Specs, Submission, TaskRecord, Timing, Want,
+    Specs, Submission, TaskRecord, Timing, UsageQuery, Want,
 };
 
 crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
@@ -34,6 +36,7 @@ crate::sql_listing::listing_queries!(sqlx::Sqlite, sqlx::SqliteConnection, super
 crate::sql_stages::stage_queries!(sqlx::SqliteConnection, super::SqliteRow);
 crate::sql_jobs::job_queries!(sqlx::SqliteConnection, super::SqliteRow);
 crate::sql_rights::rights_queries!(sqlx::SqliteConnection, super::SqliteRow);
+crate::sql_usage::usage_queries!(sqlx::SqliteConnection, super::SqliteRow);
 
 /// The number of read-only connections. It exceeds the coordinator's concurrent heavy reads, so
 /// that short reads need not wait.
@@ -301,6 +304,13 @@ impl Catalog for SqliteCatalog {
     async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError> {
         let mut c = self.reader().await?;
         query::task(&mut c, stage, task)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn usage(&self, query: &UsageQuery) -> Result<Vec<UsageRow>, CatalogError> {
+        let mut c = self.reader().await?;
+        usage_query::usage(&mut c, query)
             .await
             .map_err(|e| self.failed(e))
     }

@@ -8,9 +8,10 @@ use uuid::Uuid;
 use super::{
     job_query, jobs, query,
     rows::{ROWS, give, insert_ranges, write_rows},
+    usage_query,
     writer::{Keys, Result, WriteError},
 };
-use crate::sql::int;
+use crate::{sql::int, sql_jobs::held};
 
 /// The number of pending ranges examined for one request.
 const LOOK_AT: i64 = 256;
@@ -64,12 +65,13 @@ pub(super) async fn claim(
     let mut claims = Vec::with_capacity(wants.len());
     for want in wants {
         let key = keys.stage(c, want.stage).await?.stage;
-        let rows = sqlx::query(
+        let rows = sqlx::query(concat!(
             "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
              JOIN job ON job.key = stage.job WHERE stage = ? AND task_range.state = 0 AND owner IS NULL \
-             AND not_before_ms <= ? AND (? OR crashes = 0) AND stage.state = 1 AND job.state = 0 AND NOT job.paused \
-             ORDER BY not_before_ms, lo LIMIT ?",
-        )
+             AND not_before_ms <= ? AND (? OR crashes = 0) AND stage.state = 1 AND job.state = 0 AND NOT ",
+            held!(),
+            " ORDER BY not_before_ms, lo LIMIT ?",
+        ))
         .bind(key)
         .bind(want.now_ms)
         .bind(want.suspects)
@@ -135,6 +137,11 @@ pub(super) async fn changes(
         give(c, key, range).await?;
     }
     write_rows(c, keys, changes).await?;
+    for ((day, job), usage) in &changes.usage {
+        let job = keys.job(c, *job).await?;
+        // A catalog in SQLite has one instance at a time, so all share their rows.
+        usage_query::add(c, Uuid::nil(), (*day, job), usage).await?;
+    }
     let mut settled = Settled::default();
     for (stage, at_ms) in &changes.perhaps_over {
         settled.join(jobs::stage_over(c, keys, *stage, *at_ms).await?);

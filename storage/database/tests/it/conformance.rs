@@ -19,7 +19,7 @@ fn spec(json: &str) -> JobSpec {
     serde_json::from_str(json).unwrap()
 }
 
-fn job() -> Job {
+pub(crate) fn job() -> Job {
     Job {
         id: JobId::from_uuid(Uuid::from_u128(1)),
         spec_hash: "h".into(),
@@ -35,7 +35,7 @@ fn job() -> Job {
     }
 }
 
-fn set() -> ResultSet {
+pub(crate) fn set() -> ResultSet {
     ResultSet::of_stage(&job().spec.stages[0])
 }
 
@@ -58,7 +58,7 @@ fn range(id: u128, lo: u64, hi: u64, state: RangeState) -> Range {
     }
 }
 
-fn pending(id: u128, lo: u64, hi: u64) -> Range {
+pub(crate) fn pending(id: u128, lo: u64, hi: u64) -> Range {
     range(id, lo, hi, RangeState::Pending { not_before_ms: 0 })
 }
 
@@ -82,7 +82,7 @@ fn worker() -> Worker {
     }
 }
 
-fn output(task: u64) -> Output {
+pub(crate) fn output(task: u64) -> Output {
     Output {
         stage: stage(),
         task,
@@ -105,7 +105,7 @@ fn want(tasks: u64) -> Want {
     }
 }
 
-async fn submitted(catalog: &dyn Catalog, ranges: &[Range]) {
+pub(crate) async fn submitted(catalog: &dyn Catalog, ranges: &[Range]) {
     catalog.load().await.unwrap();
     assert!(catalog.submit(&job(), ranges, &[]).await.unwrap());
 }

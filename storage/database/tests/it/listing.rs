@@ -17,7 +17,7 @@ use picofarm_proto::{
 };
 use uuid::Uuid;
 
-fn job(n: u128, user: &str) -> Job {
+pub(crate) fn job(n: u128, user: &str) -> Job {
     let spec: JobSpec = serde_json::from_str(&format!(
         r#"{{"name": "job {n}", "scenes": {{"kind": "primitive", "count": 9, "seed": {n}}},
             "render": {{"renderer": "r"}}, "output": {{"store": "s", "dataset": "d"}}}}"#
@@ -35,7 +35,7 @@ fn job(n: u128, user: &str) -> Job {
     }
 }
 
-fn range(job: &Job, lo: u64, hi: u64) -> Range {
+pub(crate) fn range(job: &Job, lo: u64, hi: u64) -> Range {
     Range {
         id: RangeId::from_uuid(Uuid::new_v4()),
         stage: StageRef {
@@ -50,13 +50,13 @@ fn range(job: &Job, lo: u64, hi: u64) -> Range {
     }
 }
 
-async fn submit(catalog: &dyn Catalog, job: &Job) {
+pub(crate) async fn submit(catalog: &dyn Catalog, job: &Job) {
     let ranges = [range(job, 0, 4), range(job, 4, 9)];
     let event = NewEvent::new(job.id, 5, EventKind::Submitted, "9 tasks".into());
     assert!(catalog.submit(job, &ranges, &[event]).await.unwrap());
 }
 
-async fn each(check: impl AsyncFn(&dyn Catalog)) {
+pub(crate) async fn each(check: impl AsyncFn(&dyn Catalog)) {
     let folder = tempfile::tempdir().unwrap();
     let mut places = vec![CatalogPlace::Sqlite(folder.path().join("c.db"))];
     places.extend(testing::postgres().await.map(CatalogPlace::Postgres));
@@ -68,7 +68,7 @@ async fn each(check: impl AsyncFn(&dyn Catalog)) {
     }
 }
 
-fn query(limit: u32) -> JobQuery {
+pub(crate) fn query(limit: u32) -> JobQuery {
     JobQuery {
         limit,
         ..JobQuery::default()

@@ -261,6 +261,7 @@ impl Simulated {
             seconds: self.task.as_secs_f64().max(1e-4),
             adopted: false,
             traceparent: String::new(),
+            shared: 1,
         };
         say(to, Say::Done(report.clone().into()));
         self.unacknowledged.insert((lease, index), report);

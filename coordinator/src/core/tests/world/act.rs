@@ -23,6 +23,8 @@ impl World {
                         index: lease.lo + u64::from(*t) % (lease.hi - lease.lo),
                         kind: *kind,
                         message: "no".into(),
+                        milliseconds: 0,
+                        shared: 0,
                     };
                     self.instances[h].core.failed(session, &failure, self.now);
                 }
