@@ -94,7 +94,7 @@ async fn render(
     let mut farm = Local::start(
         &catalog,
         any,
-        (1, &[]),
+        (1, &[], None),
         settings,
         Guarded::default(),
         None,

@@ -75,7 +75,7 @@ impl RunTask for PythonTask {
         match training.learn(false, Some(&course))? {
             Finished::Published(manifest, adopted) => {
                 let ended = results::ended(&manifest, stores, &training.models, control)?;
-                course.finished(ended, (&manifest, adopted), control)
+                course.finished(ended, (&*manifest, adopted), control)
             }
             Finished::Left(ended) => course.left(ended, control),
         }
@@ -99,7 +99,7 @@ struct OwnTraining<'a> {
 /// The end of a training.
 enum Finished {
     /// The model is published; whether it was before.
-    Published(ModelManifest, bool),
+    Published(Box<ModelManifest>, bool),
     /// A trial ended before its training.
     Left(EndedTrial),
 }
@@ -113,7 +113,7 @@ impl OwnTraining<'_> {
             // The worker that published it may have died before it deleted the checkpoints.
             self.stores
                 .wait(self.control, self.models.delete_checkpoints(name, key))?;
-            return Ok(Finished::Published(manifest, true));
+            return Ok(Finished::Published(manifest.into(), true));
         }
         let newest = self
             .stores
@@ -158,7 +158,7 @@ impl OwnTraining<'_> {
                 self.stores
                     .wait(self.control, self.models.delete_checkpoints(name, key))?;
                 self.control.at(1.0);
-                Ok(Finished::Published(published.manifest, published.adopted))
+                Ok(Finished::Published(published.manifest.into(), published.adopted))
             }
         }
     }
