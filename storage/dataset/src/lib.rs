@@ -14,7 +14,7 @@ mod verify;
 
 pub use coding::codec::ChunkCodec;
 pub use coding::shard;
-pub use coding::squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
+pub use coding::squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale, whole_photons};
 pub use coding::transient::{CodedImage, TransientCodec};
 pub use layout::arrays::{INNER_SIDE, Layout, image_codecs, index_codecs};
 pub use layout::group::{METADATA, create_metadata, is_predictions, pretty};

@@ -8,7 +8,7 @@ use crate::{
     counting::{background, counting, judged},
     evidence::DENIED,
     fit::{Fitted, Observed},
-    geometry::geometry,
+    geometry::{geometry, late},
     hypotheses::{Chosen, SCALES, order_name},
     masks::MaskOrder,
     model::{FOCAL, LASER, Model, T0, WIDTH},
@@ -87,6 +87,11 @@ impl Found<'_> {
 
 pub(crate) fn report(f: &Findings) -> Report {
     let mut causes = geometry(&f.m.capture);
+    let late = late(&f.m.capture).filter(|_| f.pixels.cut.is_some_and(|cut| cut.late));
+    // If the gate cuts the light, it may be the gate that is short.
+    for cause in causes.iter_mut().filter(|c| late.as_ref() == Some(c)) {
+        cause.severity = Verdict::CannotTell;
+    }
     discrete(f, &mut causes);
     continuous(f, &mut causes);
     // Without any count, all pixels look dead.

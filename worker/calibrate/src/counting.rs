@@ -75,12 +75,18 @@ pub(crate) fn counting(f: &Findings, causes: &mut Vec<Cause>) {
         Fault::DeadPixels,
         &p.dead,
         match p.shade {
+            _ if p.cut.is_some() => "have no light, as far as the gate reaches",
             true => "are dead: they lack even the background that the others have",
             false => {
                 "have no light: they are dead, or in full shadow, and no background tells which"
             }
         },
-        "take what the nearest good pixels show instead; replace the sensor if many stay dark",
+        match p.cut.is_some() {
+            true => "widen the gate before pixels are called dead",
+            false => {
+                "take what the nearest good pixels show instead; replace the sensor if many stay dark"
+            }
+        },
         WRONG_DEAD,
     );
     pixels(
@@ -90,6 +96,14 @@ pub(crate) fn counting(f: &Findings, causes: &mut Vec<Cause>) {
         "mask them; the nearest good pixels fill in",
         WRONG_DEAD,
     );
+    // What the gate cuts off, or what sees nothing, is not dead.
+    for dead in causes.iter_mut().filter(|c| c.fault == Fault::DeadPixels) {
+        dead.severity = match dead.severity {
+            Verdict::Wrong if p.cut.is_some() => Verdict::CannotTell,
+            Verdict::Wrong if !p.counts => Verdict::Usable,
+            other => other,
+        };
+    }
     if let Some((most, held)) = p.ceiling {
         let histograms = all * f.m.per_spot.map_or(1, |_| f.m.capture.spots.len());
         causes.push(

@@ -96,27 +96,37 @@ pub fn geometry(capture: &Capture) -> Vec<Cause> {
             "check the field of view, the principal point, and the unit (metres) and axes of spots",
         );
     }
+    causes.extend(late(capture));
+    causes
+}
+
+/// Names spots whose light comes after the gate's end.
+pub(crate) fn late(capture: &Capture) -> Option<Cause> {
+    let model = Model::new(capture);
     // No light of a spot comes before the straight way from the laser to the spot and the camera.
     let end = capture.gate.end_m();
-    let first = |k: &usize| {
-        let (point, path) = model.spot(*k);
-        path + length(point)
+    let placed = (0..model.beams.len()).filter(|k| model.beams[*k].point.is_some());
+    let first: Vec<f64> = placed
+        .map(|k| {
+            let (point, path) = model.spot(k);
+            path + length(point)
+        })
+        .collect();
+    let (late, all) = (first.iter().filter(|x| **x > end).count(), first.len());
+    let nearest = first.iter().copied().fold(f64::INFINITY, f64::min);
+    let cause = || Found {
+        fault: Fault::Spots,
+        wrong: true,
+        value: late as f64,
+        error: 0.0,
+        unit: "spots",
+        finding: format!(
+            "the light of {late} of {all} spots comes after the gate's end: the earliest path of a spot is {nearest:.3} m, and the gate ends at {end:.3} m"
+        ),
+        advice: "state spots and laser in metres, and check the bin width and t0",
+        corrected: false,
     };
-    let late = placed.iter().filter(|k| first(k) > end).count();
-    if most(late) {
-        let nearest = placed.iter().map(first).fold(f64::INFINITY, f64::min);
-        add(
-            Fault::Spots,
-            true,
-            late as f64,
-            "spots",
-            format!(
-                "the light of {late} of {all} spots comes after the gate's end: the earliest path of a spot is {nearest:.3} m, and the gate ends at {end:.3} m"
-            ),
-            "state spots and laser in metres, and check the bin width and t0",
-        );
-    }
-    causes
+    (late > 0 && late as f64 > MOST * all as f64).then(|| cause().cause())
 }
 
 /// The earliest light of any spot, metres of path; `None` unless all spots have places.

@@ -26,6 +26,7 @@ mod causes;
 mod check;
 mod correct;
 mod counting;
+mod cut;
 mod evidence;
 mod fit;
 mod flash;
@@ -55,4 +56,4 @@ pub use pulse::Pulse;
 pub use report::{Agreement, Cause, Evidence, Fault, PulseFound, Report, SpotResidual, Verdict};
 
 /// Version of the method: changes whenever any bit of a result may change.
-pub const VERSION: &str = "calibrate-3";
+pub const VERSION: &str = "calibrate-4";

@@ -2,7 +2,11 @@
 
 use rayon::prelude::*;
 
-use crate::{Measurement, numeric::quantile};
+use crate::{
+    Measurement,
+    cut::{Cut, Lit},
+    numeric::quantile,
+};
 
 /// Share of a bright pixel's counts below which a pixel counts as unlit.
 const DEAD: f64 = 0.002;
@@ -18,10 +22,17 @@ const RISE: f64 = 0.02;
 const BEFORE: usize = 3;
 /// Bins before a pixel's own first bright bin.
 const MARGIN: usize = 8;
+/// Parts of the bins before the light, whose median part shows the background; the share of the
+/// mean below which the rest is the light of a near object, and the least counts.
+const PARTS: usize = 8;
+const UNEVEN: (f64, f64) = (0.5, 24.0);
 /// Rank of the bin that counts as a pixel's brightest, so that a return of one bounce does not.
 const RANK: usize = 8;
 /// Least count that may be a ceiling, and cells that must be at it.
-const CEILING: (f32, usize) = (100.0, 8);
+const CEILING: (f32, usize) = (15.0, 8);
+/// Count below which a ceiling must also be more frequent than all counts from this share of it on:
+/// the greatest of few counts comes up often by chance.
+const RARE: (f32, f32) = (100.0, 0.9);
 /// Spread of the greatest totals, over their median, below which a pixel's totals are limited by
 /// the number of pulses.
 const LEVEL: f64 = 0.03;
@@ -43,12 +54,16 @@ pub(crate) struct Pixels {
     pub light: f64,
     /// Greatest count, and the number of bins that hold it, if it is a ceiling.
     pub ceiling: Option<(f32, usize)>,
+    /// Whether the histograms are whole counts.
+    pub counts: bool,
     /// Photons for each unit of the histograms.
     pub gain: f32,
     /// Pulses of each histogram, stated or from totals that reach them, if pile-up shows.
     pub pulses: Option<u64>,
     /// Share of the photons of the median pixel that pile-up hides.
     pub lost: f64,
+    /// Light that the gate cuts.
+    pub cut: Option<Cut>,
 }
 
 impl Pixels {
@@ -86,7 +101,7 @@ impl Pixels {
                     } else {
                         n.min(own - MARGIN)
                     };
-                    (sum(&h[..n]) / n as f64) as f32
+                    before_light(&h[..n]) as f32
                 }
             })
             .collect();
@@ -127,12 +142,21 @@ impl Pixels {
         let good = |p: &usize| !dead[*p] && !hot[*p] && !padding[*p];
         let mut lit: Vec<f64> = (0..totals.len()).filter(good).map(|p| light[p]).collect();
         let (pulses, lost) = pile_up(m, counts, &dead, &hot);
+        let cut = Lit {
+            histogram: h,
+            bins,
+            tops: &tops,
+            dark: (dark_bins > 0).then_some(&dark),
+            gain: f64::from(gain),
+        };
         Self {
+            cut: cut.cut(),
             ceiling: counts.then(|| ceiling(cells)).flatten(),
             light: quantile(&mut lit, 0.5).unwrap_or(0.0),
             dead,
             padding,
             shade: shaded,
+            counts,
             hot,
             dark,
             dark_bins,
@@ -152,6 +176,19 @@ impl Pixels {
             })
             .collect()
     }
+}
+
+/// Returns the background of bins before the usual light: their mean, unless most of it is in a few
+/// of them, as the light of a near object is.
+fn before_light(h: &[f32]) -> f64 {
+    let mean = sum(h) / h.len() as f64;
+    let part = (h.len() / PARTS).max(1);
+    let parts = h.chunks_exact(part);
+    let mut parts: Vec<f64> = parts.map(|h| sum(h) / part as f64).collect();
+    let usual = quantile(&mut parts, 0.5).unwrap_or(mean);
+    // Few counts are uneven by chance.
+    let uneven = usual < UNEVEN.0 * mean && sum(h) > UNEVEN.1;
+    if uneven { usual } else { mean }
 }
 
 fn sum(h: &[f32]) -> f64 {
@@ -220,7 +257,10 @@ fn step(cells: &[f32]) -> f64 {
 fn ceiling(cells: &[f32]) -> Option<(f32, usize)> {
     let most = cells.iter().copied().fold(0.0f32, f32::max);
     let held = cells.iter().filter(|x| **x == most).count();
-    (most >= CEILING.0 && held >= CEILING.1).then_some((most, held))
+    let near = RARE.1 * most..most;
+    let below = || cells.iter().filter(|x| near.contains(*x)).count();
+    let heaped = most >= RARE.0 || held > below();
+    (most >= CEILING.0 && held >= CEILING.1 && heaped).then_some((most, held))
 }
 
 /// Pulses of a histogram and the share of photons that the median pixel loses. A pixel that records

@@ -181,7 +181,7 @@ impl Report {
     pub fn unexplained(&self) -> bool {
         self.causes.iter().any(|c| match c.fault {
             Fault::Unexplained | Fault::Evidence | Fault::EqualHistograms => true,
-            Fault::Spots | Fault::Camera => c.severity == Verdict::Wrong,
+            Fault::Spots | Fault::Camera => c.severity >= Verdict::CannotTell,
             _ => false,
         })
     }

@@ -3,6 +3,7 @@
 
 use crate::{
     causes::{Findings, Found, continuous, discrete},
+    cut::shortened,
     evidence::lacking,
     hypotheses::apart,
     numeric::quantile,
@@ -44,9 +45,12 @@ pub(crate) struct Failed {
     pub guesses: Vec<Cause>,
 }
 
-/// Returns why nothing may be corrected: the capture shows too little, or nothing explains it.
+/// Returns why nothing may be corrected: the capture shows too little, its gate cuts the light, or
+/// nothing explains it.
 pub(crate) fn failed(f: &Findings) -> Option<Failed> {
-    lacking(f).or_else(|| unexplained(f))
+    lacking(f)
+        .or_else(|| shortened(f))
+        .or_else(|| unexplained(f))
 }
 
 /// Returns why the refined calibration of a capture with a histogram for each spot explains

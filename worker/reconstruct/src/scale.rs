@@ -1,6 +1,6 @@
-//! Scenes of any size: the lengths of the method are those of rooms. A scene that is much smaller or
-//! larger is enlarged or reduced first, by a power of two, so that no digit changes, and the result
-//! gets its size back.
+//! Scenes of any size: the lengths of the method are those of rooms. A scene that is much smaller
+//! or larger is enlarged or reduced first, by a power of two, so that no digit changes, and the
+//! result gets its size back.
 
 use picofarm_demultiplex::room_factor;
 

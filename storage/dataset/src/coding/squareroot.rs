@@ -200,3 +200,25 @@ pub fn photon_scale(transient: &[f32], bins: usize, photons: f32) -> f32 {
         1.0
     }
 }
+
+/// The greatest distance from a whole number, as a share of it and in photons, that rounding
+/// explains.
+const ROUNDED: (f32, f32) = (1e-5, 1e-3);
+
+/// Returns whether all values of a histogram are whole numbers of photons, and some are not 0.
+/// `scale` converts values to photons.
+///
+/// ```
+/// use picofarm_dataset::whole_photons;
+///
+/// assert!(whole_photons(&[0.0, 0.5, 3.5], 2.0));
+/// assert!(!whole_photons(&[0.0, 0.5, 3.4], 2.0));
+/// ```
+pub fn whole_photons(histogram: &[f32], scale: f32) -> bool {
+    let whole = |h: &f32| {
+        let photons = h * scale;
+        (photons - photons.round()).abs() <= (ROUNDED.0 * photons).max(ROUNDED.1)
+    };
+    let some = histogram.par_iter().any(|h| h * scale >= 1.0 - ROUNDED.1);
+    some && histogram.par_iter().all(whole)
+}

@@ -47,7 +47,7 @@ use scene::Shape;
 use picofarm_dataset::{DatasetSpec, Profile, Wavelength};
 
 /// Version of the import. It changes whenever the same files could give different bytes.
-pub const IMPORT_VERSION: &str = "import-4";
+pub const IMPORT_VERSION: &str = "import-5";
 
 /// A folder of importable scenes.
 #[derive(Debug, Clone)]

@@ -8,8 +8,12 @@ use super::{IMPORT_VERSION, ImportError, ImportedScene, Source, SourceFile};
 use picofarm_dataset::Dataset;
 use picofarm_dataset::EncodedScene;
 use picofarm_dataset::Provenance;
+use picofarm_dataset::whole_photons;
 use picofarm_dataset::{ENCODER_VERSION, Manifest};
 use picofarm_store::StorageError;
+
+/// What the values of an imported measurement are, as manifests state it.
+const COUNTS: &str = "counts: photons counted in the bin, as imported";
 
 impl Source {
     /// Encodes an imported scene as scene `at` of the data set; publish it with
@@ -27,10 +31,14 @@ impl Source {
             "import": IMPORT_VERSION, "encoder": ENCODER_VERSION, "format": self.format, "options": self.options,
             "profile": dataset.spec().profile, "scene": scene.name, "files": scene.files,
         });
-        let plan = json!({
+        let mut plan = json!({
             "kind": "import", "format": self.format, "options": self.options, "scene": scene.name,
             "files": scene.files, "conversions": scene.conversions, "missing": scene.missing, "check": scene.check,
         });
+        // The code of the data set may round counts, so that they no longer show what they are.
+        if scene.with_record(|record| whole_photons(record.transient, record.scale)) {
+            plan["value"] = json!(COUNTS);
+        }
         let provenance = Provenance {
             task_key: hex::encode(Sha256::digest(key.to_string())),
             renderer: format!("{IMPORT_VERSION}/{ENCODER_VERSION}"),

@@ -286,6 +286,11 @@ async fn matlab_captures_are_put_upright_and_their_spot_is_found() {
     );
     let laser = dataset.read::<f32>(0, Quantity::Laser).await.unwrap();
     assert_eq!(laser, [-0.257, 0.0, 0.0]);
+    // A code rounds counts, but the manifest states what they are.
+    let coded = published(&source, 0, Profile::parse("sqrt-u16").unwrap()).await;
+    let manifest = coded.manifest(0).await.unwrap();
+    let value = manifest.provenance.plan["value"].as_str().unwrap();
+    assert!(value.starts_with("counts"), "{value}");
 }
 
 #[test]

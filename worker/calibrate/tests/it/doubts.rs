@@ -234,3 +234,85 @@ fn a_pulse_of_many_bins_is_measured_and_moves_nothing() {
     let off = corrected.start_m - GATE.start_m;
     assert!(off.abs() < 0.01, "{off} m");
 }
+
+/// Returns the first bins of a capture.
+fn shortened(of: &Capturing, keep: usize) -> Capturing {
+    let bins = of.gate.bins as usize;
+    let mut made = of.clone();
+    let kept = of.per_spot.chunks(bins).flat_map(|h| &h[..keep]);
+    made.per_spot = kept.copied().collect();
+    made.gate.bins = keep as u32;
+    made.add_up();
+    made
+}
+
+#[test]
+fn a_right_calibration_in_a_gate_that_cuts_the_light_is_not_called_wrong() {
+    let plain = room().measure(PHOTONS, 1, |_| {});
+    let dark = room().measure(PHOTONS, 1, |s| s.dark_per_bin = 0.05);
+    for (whole, keep) in [(&plain, 130), (&plain, 110), (&plain, 75), (&dark, 130)] {
+        let found = checked(&shortened(whole, keep), None);
+        let report = &found.report;
+        assert_eq!(report.verdict, Verdict::CannotTell, "{keep}: {report:?}");
+        let reason = report.causes.iter().find(|c| c.fault == Fault::Evidence);
+        let reason = &reason.expect("a reason").finding;
+        assert!(reason.contains("the gate cuts the light"), "{reason}");
+        assert!(report.unexplained());
+    }
+    // Enough light tells all the same.
+    let found = checked(&shortened(&plain, 250), None);
+    assert_eq!(named(&found), []);
+    let mut moved = shortened(&plain, 250);
+    let stated = moved.laser;
+    moved.laser += moved.camera.right * 0.1;
+    for place in moved.spots.iter_mut().filter_map(|s| s.place.as_mut()) {
+        let way = (place.point - moved.laser).length() - (place.point - stated).length();
+        place.path_m += way;
+    }
+    assert_eq!(named(&checked(&moved, None)), [Fault::Laser]);
+}
+
+#[test]
+fn a_near_object_is_not_hot_and_few_counts_can_be_clipped() {
+    let plain = room().measure(PHOTONS, 1, |s| s.dark_per_bin = 0.02);
+    let bins = GATE.bins as usize;
+    let pixels = (SIDE * SIDE) as usize;
+    let mut near = plain.clone();
+    for (n, h) in near.per_spot.chunks_mut(bins).enumerate() {
+        // Its light comes before that of everything else, and nothing after it.
+        if (400..420).contains(&(n % pixels)) {
+            h.rotate_left(60);
+            h[bins - 60..].fill(0.0);
+            h[8] += 60.0;
+            h[9] += 30.0;
+        }
+    }
+    near.add_up();
+    assert!(!named(&checked(&near, None)).contains(&Fault::HotPixels));
+    let mut clipped = plain.clone();
+    clipped.per_spot.iter_mut().for_each(|x| *x = x.min(63.0));
+    clipped.add_up();
+    assert!(named(&checked(&clipped, None)).contains(&Fault::Clipped));
+    let few = room().measure(5.0, 1, |_| {});
+    assert!(!named(&checked(&few, None)).contains(&Fault::Clipped));
+}
+
+#[test]
+fn pixels_that_see_nothing_are_not_dead_without_noise() {
+    let mut light = room().measure(PHOTONS, 1, |s| s.poisson = false);
+    let bins = GATE.bins as usize;
+    for (n, h) in light.per_spot.chunks_mut(bins).enumerate() {
+        let (u, v) = (n % SIDE as usize, n / SIDE as usize % SIDE as usize);
+        if (5..40).contains(&u) && (8..30).contains(&v) {
+            h.fill(0.0);
+        }
+    }
+    light.add_up();
+    let found = checked(&light, None);
+    let dead = found.report.causes.iter();
+    let dead: Vec<_> = dead.filter(|c| c.fault == Fault::DeadPixels).collect();
+    assert!(
+        matches!(&*dead, [c] if c.severity == Verdict::Usable),
+        "{dead:?}"
+    );
+}

@@ -8,8 +8,8 @@ use picofarm_scene::{Camera, Vec3};
 
 use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
 
-/// The least difference between the path to a spot and its distance from the laser by which a mirror
-/// reflected the beam, metres in a scene of the size of a room.
+/// The least difference between the path to a spot and its distance from the laser by which a
+/// mirror reflected the beam, metres in a scene of the size of a room.
 const FOLDED_M: f32 = 1e-2;
 
 /// The depth and masks of one scene. Images are row-major, `[row][column]`.

@@ -1,25 +1,17 @@
 //! Whether histograms are photon counts, to which no sensor's noise may be added unasked.
 
-use rayon::prelude::*;
+use picofarm_dataset::whole_photons;
 use serde_json::Value;
 
-/// Greatest distance from a whole number, as a share of it and in photons, that rounding explains.
-const ROUNDED: (f32, f32) = (1e-5, 1e-3);
-
-/// Returns whether the histogram of a scene is one of photon counts: by its plan a sensor
-/// drew it, or all its values are whole numbers of photons and some are not 0. `scale` converts
-/// values to photons.
+/// Returns whether the histogram of a scene is one of photon counts: its plan states that a sensor
+/// drew it or that it was counted, or its values are whole numbers of photons and some are not 0.
+/// `scale` converts values to photons.
 pub fn are_counts(histogram: &[f32], scale: f32, plan: &Value) -> bool {
     let value = plan["value"].as_str();
     if value.is_some_and(|value| value.starts_with("counts")) {
         return true;
     }
-    let whole = |h: &f32| {
-        let photons = h * scale;
-        (photons - photons.round()).abs() <= (ROUNDED.0 * photons).max(ROUNDED.1)
-    };
-    let some = histogram.par_iter().any(|h| h * scale >= 1.0 - ROUNDED.1);
-    some && histogram.par_iter().all(whole)
+    whole_photons(histogram, scale)
 }
 
 /// Returns why a sensor with this field is refused for photon counts.

@@ -7,7 +7,7 @@ mod flash;
 use picofarm_dataset::{Dataset, ENCODER_VERSION, Manifest, Quantity};
 use picofarm_demultiplex::{
     DemultiplexError, Demultiplexed, Evidence, SEPARATE_VERSION, Separate, Settings, VERSION,
-    demultiplex, separate, shadows_at, with_evidence,
+    demultiplex, residual, separate, shadows_at, with_evidence,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -128,6 +128,21 @@ impl RunTask for DemultiplexTask {
             }
         };
         proceed(control, APART)?;
+        let peaks = match (depth.is_none(), self.separate()) {
+            (false, _) => None,
+            (true, None) => residual(&flash.capture(), &made),
+            // The histograms of single spots are read one by one.
+            (true, Some(_)) => {
+                let read = Flash::of(
+                    &dataset,
+                    index,
+                    Quantity::Transient,
+                    self.demultiplex.places,
+                );
+                let all = stores.wait(control, read)?;
+                residual(&all.capture(), &made)
+            }
+        };
         let spots = spec.spots.len();
         let mut answers = Predicted {
             lit: flash.of_all(spots, &made.lit),
@@ -144,6 +159,11 @@ impl RunTask for DemultiplexTask {
         }
         manifest.agreement =
             agreement::measure(stores, (&dataset, index), &answers, &spec.spots, control)?;
+        // Depth that follows from spots agrees with them by construction, also in noise.
+        if manifest.agreement.is_object() {
+            manifest.agreement["peaks"] = json!(peaks);
+            manifest.agreement["spots"] = json!(flash.beams().len());
+        }
         let encoded = predictions
             .encode(manifest, &answers)
             .map_err(dataset_error)?;

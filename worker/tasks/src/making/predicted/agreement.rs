@@ -18,7 +18,7 @@ use crate::{
 };
 
 /// Version of the figures in a manifest.
-pub const VERSION: &str = "agreement-1";
+pub const VERSION: &str = "agreement-2";
 
 /// Compares depths with spots, and masks with both. Returns null if no depth is predicted. `lit_by`
 /// are the spots of the masks.
