@@ -124,7 +124,7 @@ fn list(path: &Path, output: Output) -> Result<()> {
                     proof(&e.certificate),
                     until(e.expires),
                     e.max_cores
-                        .map_or_else(String::new, |n| format!("{n} cores")),
+                        .map_or_else(String::new, |n| format!("at most {n} cores")),
                     projects.join(", "),
                 ]
             })

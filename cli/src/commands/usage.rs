@@ -12,7 +12,7 @@ use crate::{
     args::Usage,
     client::Client,
     error::{CliError, Result},
-    output::{Output, table},
+    output::{Output, bytes, table},
     settings::Settings,
 };
 
@@ -57,10 +57,10 @@ fn line(row: &UsageRow, by: UsageBy) -> Vec<String> {
     };
     vec![
         name,
-        format!("{:.2}", usage.core_ms as f64 / 3.6e6),
+        format!("{:.3}", usage.core_ms as f64 / 3.6e6),
         usage.tasks.to_string(),
         usage.failures.to_string(),
-        format!("{:.2} GB", usage.bytes as f64 / 1e9),
+        bytes(usage.bytes),
     ]
 }
 

@@ -1,27 +1,9 @@
 //! The bound on the cores that the jobs of one user use at a time. These are the cores of the
 //! workers with leases of these jobs. A worker counts whole, because its tasks use all its threads.
 
-use std::collections::BTreeMap;
-
 use picofarm_proto::ids::WorkerId;
 
-use super::state::Core;
-
-/// The most cores that each user's jobs use at a time.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub(crate) struct CoreQuotas {
-    /// The bound for users without one of their own; `None` for no bound.
-    pub every: Option<u32>,
-    /// The bounds of single users.
-    pub of: BTreeMap<String, u32>,
-}
-
-impl CoreQuotas {
-    /// Returns the bound of a user, if any.
-    fn of(&self, user: &str) -> Option<u32> {
-        self.of.get(user).copied().or(self.every)
-    }
-}
+use super::{settings::CoreQuotas, state::Core};
 
 impl Core {
     /// Replaces the bounds. Leases beyond a lower bound stay.

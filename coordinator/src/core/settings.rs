@@ -1,4 +1,6 @@
-//! The core's time limits and its source of ids.
+//! The core's time limits, its source of ids, and the bounds on users.
+
+use std::collections::BTreeMap;
 
 use uuid::Uuid;
 
@@ -26,4 +28,20 @@ pub(crate) struct Settings {
     /// Shortest run time after which an idle worker runs a task a second time, milliseconds. The
     /// task must also have taken three times the mean of its stage.
     pub slow_ms: u32,
+}
+
+/// The most cores that each user's jobs use at a time.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(crate) struct CoreQuotas {
+    /// The bound for users without one of their own; `None` for no bound.
+    pub every: Option<u32>,
+    /// The bounds of single users.
+    pub of: BTreeMap<String, u32>,
+}
+
+impl CoreQuotas {
+    /// Returns the bound of a user, if any.
+    pub(super) fn of(&self, user: &str) -> Option<u32> {
+        self.of.get(user).copied().or(self.every)
+    }
 }

@@ -146,6 +146,8 @@ async fn a_job_after_another_begins_when_that_one_is_done() {
         let status = farm.status(&second).await;
         assert!(!status.paused && status.spec.after == [first.clone(), first.clone()]);
         assert!(worker.done(&lease, 0).await.accepted);
+        // The coordinator asks the catalog again after a moment.
+        farm.pass(1_000);
         let lease = match worker.hear().await.unwrap() {
             Heard::Lease(lease) => lease,
             other => panic!("expected a lease, heard {other:?}"),

@@ -5,6 +5,7 @@
 use std::{
     fs::{self, File},
     io,
+    os::unix::fs::{MetadataExt, chown},
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -75,6 +76,7 @@ pub async fn restore(file: &Path, catalog: &Path, replace: bool, holder: &str) -
     let _lock = CatalogLock::take(catalog, holder)?;
     let (copy, backup) = copy(file, catalog).await?;
     if catalog.exists() {
+        keep_access(catalog, copy.path())?;
         drop_log(catalog).await?;
     }
     publish(copy, catalog, replace)?;
@@ -225,6 +227,17 @@ async fn check_schema(c: &mut SqliteConnection, path: &Path) -> Result<i64> {
         what,
     };
     Ok(last.ok_or_else(unusable)?)
+}
+
+/// Gives a copy the mode and the owner of the catalog that it replaces.
+fn keep_access(catalog: &Path, copy: &Path) -> Result<()> {
+    let failed = |e| write(catalog, "keeping its owner and mode", e);
+    let former = fs::metadata(catalog).map_err(failed)?;
+    let now = fs::metadata(copy).map_err(failed)?;
+    if (former.uid(), former.gid()) != (now.uid(), now.gid()) {
+        chown(copy, Some(former.uid()), Some(former.gid())).map_err(failed)?;
+    }
+    fs::set_permissions(copy, former.permissions()).map_err(failed)
 }
 
 /// Moves the log of a closed catalog that is about to be replaced into its file, so that the log

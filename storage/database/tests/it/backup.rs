@@ -1,6 +1,6 @@
 //! Tests of backups: taken during writes, complete or absent, and never over another file.
 
-use std::{fs, path::PathBuf};
+use std::{fs, os::unix::fs::PermissionsExt, path::PathBuf};
 
 use picofarm_catalog::{Catalog, CatalogError, Changes};
 use picofarm_database::{BackupError, SqliteCatalog, backup, restore};
@@ -109,7 +109,11 @@ async fn nothing_is_replaced_without_leave_and_then_as_a_whole() {
     let killed = place.at("killed.db");
     let error = restore(&copy, &killed, false, "me").await.unwrap_err();
     assert!(matches!(error, BackupError::Exists(_)), "{error}");
+    let mode = fs::Permissions::from_mode(0o640);
+    fs::set_permissions(&killed, mode.clone()).unwrap();
     restore(&copy, &killed, true, "me").await.unwrap();
+    let now = fs::metadata(&killed).unwrap().permissions();
+    assert_eq!(now.mode() & 0o777, mode.mode());
     assert!(!place.at("killed.db-wal").exists());
     let restored = place.open("killed.db").await;
     restored.load().await.unwrap();
