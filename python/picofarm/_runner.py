@@ -20,12 +20,15 @@ import shutil
 import signal
 import socket
 import sys
+import time
 import traceback
 import types
 from typing import Any, NoReturn
 
 # Exit status of a task whose requirements are not installed.
 UNMET = 78
+# Seconds in which killed processes are waited for.
+_END_WITHIN = 3.0
 # Numbers of Linux's prctl.
 _PARENT_DEATH, _CHILD_SUBREAPER, _NO_NEW_PRIVILEGES = 1, 36, 38
 
@@ -59,11 +62,17 @@ def _descendants() -> list[int]:
 
 
 def _end_all() -> None:
-    for pid in _descendants():
-        try:
-            os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
+    """Kills the processes below this one, and waits until they are gone."""
+    until = time.monotonic() + _END_WITHIN
+    while (found := _descendants()) and time.monotonic() < until:
+        for pid in found:
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+        # As the subreaper, this process is the parent of all that have lost theirs.
+        _reap(0)
+        time.sleep(0.01)
 
 
 def _reap(work: int) -> int | None:
@@ -96,6 +105,9 @@ def _supervise(watch: socket.socket, work: int, folder: str) -> NoReturn:
         if watch in ready and not watch.recv(1):
             _end_all()
             shutil.rmtree(folder, ignore_errors=True)
+            if os.getpgrp() == os.getpid():
+                # Where there is no /proc, this ends at least the group.
+                os.killpg(0, signal.SIGKILL)
             os._exit(1)
         if reading in ready:
             os.read(reading, 4096)
