@@ -61,6 +61,10 @@ pub struct Up {
     /// devices`
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
+    /// Python (3.10 or newer) that runs code of jobs (kind = "python"), as the user of this process
+    /// [default: no such jobs]
+    #[arg(long, value_name = "PATH", env = "PICOFARM_PYTHON_TASKS")]
+    pub python: Option<PathBuf>,
     /// Serve no pages for a browser. Otherwise they are at 127.0.0.1:7421, or at a free port if
     /// that is in use
     #[arg(long)]
@@ -169,6 +173,10 @@ pub struct Worker {
     /// (cuda:0,cuda:1). Each is tested first
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
+    /// Python (3.10 or newer) that runs code of jobs (kind = "python"), as the user of this process
+    /// [default: no such jobs]
+    #[arg(long, value_name = "PATH", env = "PICOFARM_PYTHON_TASKS")]
+    pub python: Option<PathBuf>,
     /// Address at which other workers reach this one to train a network together
     /// (`train.processes`). Any process that reaches it and can read the store can join
     #[arg(long, value_name = "HOST[:PORT]", default_value = "127.0.0.1")]

@@ -3,7 +3,7 @@
 use std::{path::PathBuf, time::SystemTime};
 
 use clap::{Args, Subcommand};
-use picofarm_coordinator::auth::{Expiry, Role, Visibility};
+use picofarm_coordinator::auth::{Expiry, OwnCode, Role, Visibility};
 
 /// TLS, tokens and limits of a coordinator.
 #[derive(Args)]
@@ -38,6 +38,10 @@ pub struct Guard {
     /// Allow to run without TLS or tokens where they are required
     #[arg(long)]
     pub allow_insecure: bool,
+    /// Accept jobs with Python code of their own (kind = "python"), from everyone (all) or in these
+    /// projects. Workers with --python run the code as their own user [default: from nobody]
+    #[arg(long, value_name = "all|PROJECTS", env = "PICOFARM_ALLOW_PYTHON")]
+    pub allow_python: Option<OwnCode>,
     /// Maximum number of active jobs of one caller
     #[arg(long, value_name = "N", default_value_t = 1_000, value_parser = super::ranges::at_least_one)]
     pub max_jobs_per_user: usize,

@@ -6,7 +6,7 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use picofarm_coordinator::{
     Connections, CoordinatorConfig, CoordinatorError, MemoryBounds, ResultReader, Running,
-    auth::{Access, Quotas, TlsFiles},
+    auth::{Access, OwnCode, Quotas, TlsFiles},
     serve,
 };
 use picofarm_database::CatalogPlace;
@@ -28,6 +28,7 @@ pub struct Guarded {
     access: Access,
     quotas: Quotas,
     connections: Connections,
+    own_code: OwnCode,
     /// Memory limit of the process, in MiB.
     memory_mib: Option<u64>,
     /// Number of days for which the audit log is retained.
@@ -59,8 +60,16 @@ impl Guarded {
                 per_address: args.max_connections_per_address,
                 ..Connections::default()
             },
+            own_code: args.allow_python.clone().unwrap_or_default(),
             memory_mib: args.memory_mib,
             audit_days: Some(args.audit_days),
+        }
+    }
+
+    /// Accepts jobs with Python code from everyone, unless the options say otherwise.
+    pub fn allow_python(&mut self) {
+        if self.own_code == OwnCode::Nobody {
+            self.own_code = OwnCode::Everyone;
         }
     }
 
@@ -152,6 +161,7 @@ impl Coordinator {
         let secure = guarded.access.tls.is_some();
         config.access = guarded.access;
         config.quotas = guarded.quotas;
+        config.own_code = guarded.own_code;
         config.connections = guarded.connections;
         config.memory = memory(guarded.memory_mib);
         if let Some(days) = guarded.audit_days {

@@ -176,7 +176,7 @@ pub async fn run(args: Demo, settings: &Settings, output: Output) -> Result<()> 
     let mut farm = Local::start(
         &dir.join("catalog.sqlite"),
         any,
-        (workers, &[]),
+        (workers, &[], None),
         settings,
         Guarded::default(),
         None,

@@ -44,12 +44,15 @@ impl Local {
     pub async fn start(
         catalog: &Path,
         listen: SocketAddr,
-        (workers, gpus): (usize, &[String]),
+        (workers, gpus, python): (usize, &[String], Option<&Path>),
         settings: &Settings,
-        guarded: Guarded,
+        mut guarded: Guarded,
         http: Option<SocketAddr>,
         otlp: Option<String>,
     ) -> Result<Self> {
+        if python.is_some() {
+            guarded.allow_python();
+        }
         let open = guarded.is_open();
         if !open {
             // Errors in the settings are reported here once, and not by each worker.
@@ -92,6 +95,7 @@ impl Local {
                     None => String::new(),
                 },
                 gpus: gpus.iter().skip(i).step_by(workers).cloned().collect(),
+                python: python.map(Path::to_owned),
                 otlp: otlp.clone(),
                 ended: String::new(),
             };

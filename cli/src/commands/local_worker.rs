@@ -2,7 +2,10 @@
 //! reads until the line `stop`, which asks for an orderly end, or until the end of its input: then
 //! the parent has died, and the process ends at once.
 
-use std::io::{BufRead, Write};
+use std::{
+    io::{BufRead, Write},
+    path::PathBuf,
+};
 
 use picofarm_proto::ids::WorkerId;
 use picofarm_settings::Gpus;
@@ -48,6 +51,8 @@ pub struct Order {
     pub memory_from: String,
     /// GPUs, by name.
     pub gpus: Vec<String>,
+    /// The Python that runs code of jobs.
+    pub python: Option<PathBuf>,
     /// URL of the trace collector.
     pub otlp: Option<String>,
     /// How the previous process ended; empty for the first.
@@ -142,6 +147,7 @@ async fn work(order: Order) -> Result<()> {
         exit_idle: None,
         ends_at: crate::args::end_time::ends_at(None, std::time::SystemTime::now())?,
         asset_dirs: vec![order.settings.assets],
+        python: order.python,
         access,
         store_prefixes: Vec::new(),
     };

@@ -39,6 +39,7 @@ pub async fn run(args: Worker, settings: &Settings, output: Output) -> Result<()
         exit_idle: args.exit_idle_s.map(Duration::from_secs),
         ends_at: end_time::ends_at(args.end_at, SystemTime::now())?,
         asset_dirs: vec![settings.assets.clone()],
+        python: args.python,
         access: settings.access()?,
         store_prefixes: args.store_prefix,
     };

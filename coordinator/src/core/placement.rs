@@ -37,6 +37,10 @@ pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(
     let (kind, version) = (stage.task.kind(), stage.task.version());
     let ability = stage.task.ability();
     match worker.kinds.get(&*ability) {
+        None if kind == "python" => {
+            let what = "the worker runs no Python code of jobs; start one with --python PATH";
+            return Err(what.into());
+        }
         None => return Err(format!("the worker runs no {ability} tasks")),
         Some(theirs) if theirs != version => {
             return Err(format!(

@@ -240,14 +240,15 @@ mod tests {
     #[test]
     fn a_stage_without_a_version_gets_an_error_about_itself() {
         let promote = PromoteTask {
-            source: SourceSettings {
+            source: Some(SourceSettings {
                 store: "s".into(),
                 dataset: "d".into(),
-            },
+            }),
             count: 1,
             promote: PromoteSettings {
                 model: "best".into(),
                 among: vec!["a".into()],
+                store: String::new(),
                 tolerate_missing: false,
                 version: String::new(),
             },

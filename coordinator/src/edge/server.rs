@@ -81,6 +81,8 @@ pub struct CoordinatorConfig {
     pub access: Access,
     /// Quotas.
     pub quotas: Quotas,
+    /// Whose jobs may bring Python code; by default nobody's.
+    pub own_code: OwnCode,
     /// Bounds on connections.
     pub connections: Connections,
     /// Memory for requests and jobs.
@@ -112,6 +114,7 @@ impl CoordinatorConfig {
             clock: Clock::system(),
             access: Access::default(),
             quotas: Quotas::default(),
+            own_code: OwnCode::default(),
             connections: Connections::default(),
             memory: MemoryBounds::default(),
             http: None,
@@ -333,9 +336,13 @@ async fn start(
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
         .add_service(
-            JobsServer::new(JobsService::new(link.clone(), config.quotas))
-                .max_decoding_message_size(MAX_MESSAGE_BYTES)
-                .max_encoding_message_size(MAX_MESSAGE_BYTES),
+            JobsServer::new(JobsService::new(
+                link.clone(),
+                config.quotas,
+                config.own_code,
+            ))
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES),
         )
         .add_service(
             FarmServer::new(FarmService::new(link, config.quotas))

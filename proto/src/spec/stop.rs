@@ -1,6 +1,6 @@
 //! Early stopping of trials in a sweep: the rules, and the epochs after which a trial is checked.
 //! The earlier results of other trials are in the store, and the training worker compares with them
-//! (`worker/tasks`, `kinds/train/verdict.rs`).
+//! (`worker/tasks`, `trial/verdict.rs`).
 //!
 //! - **Halving** is the stopping variant of ASHA (Li et al., "A System for Massively Parallel
 //!   Hyperparameter Tuning", MLSys 2020). A trial that reaches a rung continues if it is among the

@@ -23,6 +23,8 @@
 //! depend on the number of trials or on the origin of their values, so that an extended sweep stays
 //! the same, and its trials are compared with the earlier ones.
 //!
+//! Own trainings (`kind = "python"`) are swept in the same way.
+//!
 //! [`super::stop`] defines when inferior trials stop. No trial waits for another, and a stopped
 //! trial leaves its worker to the next. The set of trials that run to the end therefore depends on
 //! their order. The result of each trial does not.
@@ -78,29 +80,39 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     let fail = |field: &str, what: String| Err(SpecError::new(format!("stage.{field}"), what));
     // The data set counts, the location of its store does not.
     let source = stage.get("source").map(|s| s.get("dataset").unwrap_or(s));
+    let of =
+        |stage: &Value, field: &str| stage.get(field).and_then(Value::as_str).map(str::to_owned);
+    let kind = match of(&stage, "kind").as_deref() {
+        Some("train") => "train",
+        Some("python") => "python",
+        _ => {
+            let what = "belongs to kind = \"train\" or \"python\"; remove it";
+            return fail("sweep", what.into());
+        }
+    };
+    let mut training = stage[kind].clone();
+    let store = training.as_object_mut().and_then(|t| t.remove("store"));
     let described = json!([
         source,
-        stage["train"],
+        training,
         sweep["over"],
         sweep["seed"],
         sweep["stop"]
     ]);
     let sweep: SweepText =
         serde_json::from_value(sweep).map_err(|e| SpecError::new("stage.sweep", e.to_string()))?;
-    let of =
-        |stage: &Value, field: &str| stage.get(field).and_then(Value::as_str).map(str::to_owned);
-    if of(&stage, "kind").as_deref() != Some("train") {
-        return fail("sweep", "belongs to kind = \"train\"; remove it".into());
-    }
-    let Some(model) = stage.get("train").and_then(|train| of(train, "model")) else {
-        return fail("train.model", "is missing; name the model".into());
+    let Some(model) = stage.get(kind).and_then(|training| of(training, "model")) else {
+        return fail(
+            &format!("{kind}.model"),
+            "is missing; name the model".into(),
+        );
     };
     if let Some(stop) = sweep.stop {
         stop.check()
             .map_err(|e| SpecError::new(format!("stage.{}", e.field), e.what))?;
     }
     let chosen = sweep.choose()?;
-    let name = of(&stage, "name").unwrap_or_else(|| "train".into());
+    let name = of(&stage, "name").unwrap_or_else(|| kind.into());
     let id = id(described);
     let (mut stages, mut models) = (Vec::new(), Vec::new());
     for (index, values) in chosen.into_iter().enumerate() {
@@ -122,8 +134,8 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
         }
         trial["name"] = json!(format!("{name}.{index}"));
         let called = format!("{model}.{index}");
-        trial["train"]["model"] = json!(called);
-        trial["train"]["trial"] = serde_json::to_value(Trial {
+        trial[kind]["model"] = json!(called);
+        trial[kind]["trial"] = serde_json::to_value(Trial {
             sweep: model.clone(),
             id: id.clone(),
             index: index as u64,
@@ -149,10 +161,11 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
         true => model,
         false => sweep.promote,
     };
-    promote.insert(
-        "promote".into(),
-        json!({ "model": named, "among": models, "tolerate_missing": tolerant }),
-    );
+    let mut settings = json!({ "model": named, "among": models, "tolerate_missing": tolerant });
+    if let Some(store) = store {
+        settings["store"] = store;
+    }
+    promote.insert("promote".into(), settings);
     stages.push(Value::Object(promote));
     Ok(stages)
 }

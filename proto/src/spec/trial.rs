@@ -33,19 +33,17 @@ pub struct Trial {
 }
 
 impl Trial {
-    pub(super) fn check(&self) -> Result<(), SpecError> {
-        check_model("train.trial.sweep", &self.sweep)?;
+    /// Checks a trial in a field.
+    pub(super) fn check(&self, field: &str) -> Result<(), SpecError> {
+        check_model(&format!("{field}.sweep"), &self.sweep)?;
         let hex = self.id.len() == 16 && self.id.bytes().all(|b| b.is_ascii_hexdigit());
         if !hex {
             let what = format!("{:?} is not 16 hexadecimal digits", self.id);
-            return Err(SpecError::new("train.trial.id", what));
+            return Err(SpecError::new(format!("{field}.id"), what));
         }
         for (parameter, domain) in &self.over {
             if let Some(what) = domain.fault() {
-                return Err(SpecError::new(
-                    format!("train.trial.over.{parameter}"),
-                    what,
-                ));
+                return Err(SpecError::new(format!("{field}.over.{parameter}"), what));
             }
         }
         match self.stop {

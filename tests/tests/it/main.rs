@@ -28,6 +28,7 @@ mod imports;
 mod leases;
 mod memory;
 mod operations;
+mod own_training;
 mod parts;
 mod python;
 mod reconstruct;

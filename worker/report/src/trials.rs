@@ -317,6 +317,7 @@ fn far_apart(values: impl Iterator<Item = f64>) -> bool {
 pub fn error_name(kind: &str) -> &'static str {
     match kind {
         "tof" => "MAE (m)",
+        "python" => "objective",
         _ => "1 − IoU",
     }
 }

@@ -42,6 +42,8 @@ pub struct AgentConfig {
     pub ends_at: Option<SystemTime>,
     /// Additional folders with furniture.
     pub asset_dirs: Vec<PathBuf>,
+    /// The Python that runs code of jobs; `None` = the worker runs none.
+    pub python: Option<PathBuf>,
     /// The worker's credentials, and the certificate authorities it trusts.
     pub access: Access,
     /// Paths or URLs that must contain tasks' outputs and scene files; without any, all places are

@@ -1,14 +1,17 @@
 //! The table of all kinds of task, and the executor that runs their tasks.
 
-use std::{collections::BTreeMap, path::PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use picofarm_files::Opener;
 use picofarm_proto::spec::{
     EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
     kinds::{
-        CalibrateTask, Declared, DemultiplexTask, ReconstructTask, VerifyTask, export::FORMATS,
-        reconstruct::MLP,
+        CalibrateTask, Declared, DemultiplexTask, PythonTask, ReconstructTask, VerifyTask,
+        export::FORMATS, reconstruct::MLP,
     },
 };
 use picofarm_session::{AgentError, Executor};
@@ -16,7 +19,7 @@ use picofarm_settings::Gpus;
 use tokio::runtime::Handle;
 
 #[cfg(feature = "networks")]
-use crate::device;
+use crate::{device, interpreter::Interpreter};
 use crate::{
     input::scenes,
     stores::{STORE_PATIENCE, Stores},
@@ -67,6 +70,7 @@ kinds! {
     EvaluateShard(EvaluateShardTask),
     Demultiplex(DemultiplexTask),
     Calibrate(CalibrateTask),
+    Python(PythonTask),
 }
 
 /// Optional parts of kinds, and whether this program was built with them. See
@@ -131,6 +135,8 @@ impl TaskExecutor {
             gpus: Vec::new(),
             #[cfg(feature = "networks")]
             models: Latest::default(),
+            #[cfg(feature = "networks")]
+            python: None,
         })
     }
 
@@ -173,6 +179,47 @@ impl TaskExecutor {
         Ok(self)
     }
 
+    /// Runs Python code of jobs with this interpreter. Without one, no such tasks are accepted.
+    ///
+    /// # Errors
+    /// [`AgentError::Config`] if the interpreter cannot be used, or this program was built without
+    /// networks.
+    #[cfg_attr(not(feature = "networks"), expect(unused_mut))]
+    pub fn with_python(mut self, python: Option<&Path>) -> Result<Self, AgentError> {
+        let Some(path) = python else {
+            return Ok(self);
+        };
+        let refused = |what: String| AgentError::Config {
+            field: "python",
+            what,
+        };
+        #[cfg(feature = "networks")]
+        {
+            let found = Interpreter::find(path).map_err(refused)?;
+            tracing::info!(
+                "runs Python code of jobs with {} ({})",
+                path.display(),
+                found.version()
+            );
+            self.0.python = Some(found);
+            Ok(self)
+        }
+        #[cfg(not(feature = "networks"))]
+        Err(refused(format!(
+            "{}: this program was built without networks, which own training is a part of",
+            path.display()
+        )))
+    }
+
+    /// Returns whether tasks of a kind can run here.
+    fn runs(&self, kind: &str) -> bool {
+        #[cfg(feature = "networks")]
+        let python = self.0.python.is_some();
+        #[cfg(not(feature = "networks"))]
+        let python = false;
+        kind != PythonTask::NAME || python
+    }
+
     /// Sets the memory that tasks may use, in MiB; 0 = unknown.
     #[must_use]
     pub fn with_memory(self, memory_mib: u64) -> Self {
@@ -187,7 +234,7 @@ impl Executor for TaskExecutor {
     fn kinds(&self) -> BTreeMap<String, String> {
         let built = versions()
             .into_iter()
-            .filter(|(_, version)| !version.is_empty());
+            .filter(|(kind, version)| !version.is_empty() && self.runs(kind));
         let parts = PARTS.iter().filter(|(_, _, built)| *built);
         let parts = parts.map(|(kind, part, _)| (format!("{kind}:{part}"), version(kind)));
         built

@@ -8,16 +8,21 @@
 //!
 //! The modules form layers. Each module imports only modules of layers below its own, and a kind of
 //! task imports no other kind. From the top: `run`, `executor`, `kinds`, `repair`, `making`,
-//! `input`, `device`, `task`, `saver`, `stores`, `submission`, `memory`, `errors`.
+//! `input`, `python`, `trial`, `device`, `task`, `interpreter`, `saver`, `stores`, `submission`,
+//! `memory`, `errors`.
 
 #[cfg(feature = "networks")]
 mod device;
 mod errors;
 mod executor;
 mod input;
+#[cfg(feature = "networks")]
+mod interpreter;
 mod kinds;
 mod making;
 mod memory;
+#[cfg(feature = "networks")]
+mod python;
 pub mod repair;
 mod run;
 #[cfg(feature = "networks")]
@@ -25,6 +30,8 @@ mod saver;
 mod stores;
 mod submission;
 mod task;
+#[cfg(feature = "networks")]
+mod trial;
 
 pub use executor::{TaskExecutor, resolve};
 pub use input::camera::slant;

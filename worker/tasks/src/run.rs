@@ -19,6 +19,7 @@ pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Sum
     let executor = TaskExecutor::new(&config.asset_dirs, Handle::current(), files)
         .with_memory(config.memory_mib)
         .reached_at(&config.peers)
-        .with_gpus(&config.gpus)?;
+        .with_gpus(&config.gpus)?
+        .with_python(config.python.as_deref())?;
     run_with(config, Arc::new(executor), shutdown).await
 }

@@ -12,6 +12,8 @@ use picofarm_proto::spec::{ImportSettings, SpecError};
 use picofarm_scene::AssetLibrary;
 pub use picofarm_session::{Control, Output, Task, TaskError};
 
+#[cfg(feature = "networks")]
+use crate::interpreter::Interpreter;
 use crate::{stores::Stores, submission::Submission};
 
 /// Runs the tasks of a kind.
@@ -57,6 +59,9 @@ pub(crate) struct Context {
     /// The models that the latest inference used.
     #[cfg(feature = "networks")]
     pub models: Latest<Models>,
+    /// The interpreter for Python code of jobs; `None` = such tasks are not accepted.
+    #[cfg(feature = "networks")]
+    pub python: Option<Interpreter>,
 }
 
 impl Context {

@@ -235,10 +235,12 @@ impl NewFile {
 fn find(stages: &[picofarm_proto::spec::StageSpec], stage: Option<&str>) -> Result<Sweep> {
     let mut sweeps: Vec<Sweep> = Vec::new();
     for spec in stages {
-        let TaskSpec::Train(task) = &spec.task else {
-            continue;
+        let (trial, store) = match &spec.task {
+            TaskSpec::Train(task) => (&task.train.trial, &task.source.store),
+            TaskSpec::Python(task) => (&task.python.trial, task.store()),
+            _ => continue,
         };
-        let Some(trial) = &task.train.trial else {
+        let Some(trial) = trial else {
             continue;
         };
         let end = format!(".{}", trial.index);
@@ -246,7 +248,7 @@ fn find(stages: &[picofarm_proto::spec::StageSpec], stage: Option<&str>) -> Resu
         match sweeps.last_mut() {
             Some(sweep) if sweep.stage == name => sweep.trials.push(trial.clone()),
             _ => sweeps.push(Sweep {
-                store: task.source.store.clone(),
+                store: store.clone(),
                 stage: name.to_owned(),
                 trials: vec![trial.clone()],
             }),

@@ -14,6 +14,9 @@ use crate::{
     error::{CliError, Code, Result},
 };
 
+/// Kind of the trials of own trainings.
+const OWN: &str = "python";
+
 /// The records of a sweep's trials.
 pub struct Records {
     pub name: String,
@@ -127,8 +130,13 @@ fn ended_trial(trial: &TrialRecord) -> Result<Row> {
         TrialEnd::Pruned => (End::Pruned, String::new()),
         TrialEnd::Diverged(why) => (End::Diverged, why.clone()),
     };
-    let lines = trial.history.iter().cloned().map(serde_json::from_value);
-    let history: serde_json::Result<Vec<Line>> = lines.collect();
+    let history: serde_json::Result<Vec<Line>> = match &*trial.kind {
+        OWN => Ok(trial.history.iter().filter_map(own_line).collect()),
+        _ => {
+            let lines = trial.history.iter().cloned();
+            lines.map(serde_json::from_value).collect()
+        }
+    };
     let broken = |e| CliError::new(Code::Damaged, format!("trial {}: {e}", trial.index));
     Ok(Row {
         index: trial.index,
@@ -143,6 +151,18 @@ fn ended_trial(trial: &TrialRecord) -> Result<Row> {
         epochs: trial.epochs,
         loss: trial.loss,
         history: history.map_err(broken)?,
+    })
+}
+
+/// Returns a report of an own training that has the objective, as a line of a history.
+fn own_line(report: &Value) -> Option<Line> {
+    Some(Line {
+        epoch: report["epoch"].as_u64().unwrap_or(0),
+        within: false,
+        step: report["step"].as_u64().unwrap_or(0),
+        loss: report["loss"].as_f64()?,
+        learning_rate: 0.0,
+        validation: None,
     })
 }
 

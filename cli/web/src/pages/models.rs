@@ -238,6 +238,10 @@ fn curve(history: &[Value]) -> Markup {
 /// minus IoU.
 fn validation_loss(line: &Value) -> Option<f64> {
     let found = &line["validation"];
+    if found.is_null() && line["metrics"].is_object() {
+        // An own training, whose loss is its objective.
+        return line["loss"].as_f64();
+    }
     let mae = found["mae_m"].as_f64();
     mae.or_else(|| Some(1.0 - found["iou"].as_f64()?))
 }

@@ -24,7 +24,7 @@ use super::{
 };
 use crate::{
     actor::{Command, Submitted},
-    auth::{Caller, Quotas},
+    auth::{Caller, OwnCode, Quotas},
     core::VERSION,
     memory::Account,
     submission::Draft,
@@ -41,11 +41,16 @@ const WORKER: u64 = 4 << 10;
 pub(crate) struct JobsService {
     link: Link,
     quotas: Quotas,
+    own_code: Arc<OwnCode>,
 }
 
 impl JobsService {
-    pub(crate) fn new(link: Link, quotas: Quotas) -> Self {
-        Self { link, quotas }
+    pub(crate) fn new(link: Link, quotas: Quotas, own_code: OwnCode) -> Self {
+        Self {
+            link,
+            quotas,
+            own_code: Arc::new(own_code),
+        }
     }
 
     /// Reads and checks a spec on a separate thread, because a large one takes seconds.
@@ -59,11 +64,12 @@ impl JobsService {
         let charge = account.charge_spec(&wire.json).await?;
         let account = account.clone();
         let (bytes, quotas, by) = (wire.json.len(), self.quotas, by.clone());
+        let own_code = Arc::clone(&self.own_code);
         let draft = self
             .link
             .lanes
             .heavy(bytes, move || async move {
-                draft(wire, bytes, &quotas, &by, (account, charge))
+                draft(wire, bytes, (&quotas, &own_code), &by, (account, charge))
             })
             .await?;
         Ok(Arc::new(draft))

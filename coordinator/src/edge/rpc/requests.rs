@@ -10,7 +10,7 @@ use tonic::Status;
 
 use super::link::invalid;
 use crate::{
-    auth::{Caller, Quotas},
+    auth::{Caller, OwnCode, Quotas},
     memory::{Account, Charge},
     submission::Draft,
 };
@@ -78,7 +78,7 @@ pub(super) fn listing(
 pub(super) fn draft(
     wire: wire::JobSpec,
     bytes: usize,
-    quotas: &Quotas,
+    (quotas, own_code): (&Quotas, &OwnCode),
     by: &Caller,
     charged: (Account, Charge),
 ) -> Result<Draft, Status> {
@@ -86,6 +86,7 @@ pub(super) fn draft(
     spec.check_submitted().map_err(|e| invalid(e.into()))?;
     by.may_submit(&spec, quotas.max_priority)
         .map_err(|e| invalid(e.into()))?;
+    own_code.check(&spec).map_err(|e| invalid(e.into()))?;
     let most = quotas.tasks_per_job;
     let tasks: u64 = spec.stages.iter().map(StageSpec::tasks).sum();
     if tasks > most {

@@ -19,6 +19,7 @@ mod kind;
 pub(super) mod names;
 mod part;
 mod promote;
+pub mod python;
 pub mod reconstruct;
 pub mod render;
 pub mod report;
@@ -49,6 +50,7 @@ pub use io::{Io, IoMut, Makes, ModelNames};
 pub use kind::{Declared, Dispatch, Manifest, Results, TaskKind};
 pub use part::PartTask;
 pub use promote::{PromoteSettings, PromoteTask};
+pub use python::{CodeFile, Goal, PythonSettings, PythonTask};
 pub use reconstruct::{ReconstructSettings, ReconstructTask};
 pub use render::RenderTask;
 pub use report::ReportTask;
@@ -152,6 +154,8 @@ kinds! {
     Demultiplex(DemultiplexTask),
     /// Checks and corrects the calibration of a measured scene: one task.
     Calibrate(CalibrateTask),
+    /// Runs a Python file: one task.
+    Python(PythonTask),
 }
 
 /// A kind, for reading job files.

@@ -21,8 +21,10 @@ use crate::spec::{
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PromoteTask {
     /// The training data set, with the models in its store.
-    pub source: SourceSettings,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub source: Option<SourceSettings>,
     /// Number of scenes of the data set.
+    #[serde(skip_serializing_if = "is_zero")]
     pub count: u64,
     /// The models and the name.
     pub promote: PromoteSettings,
@@ -36,6 +38,9 @@ pub struct PromoteSettings {
     pub model: String,
     /// The candidate models, or stages that train them. Trials that stopped early are skipped.
     pub among: Vec<String>,
+    /// The store of the models, for a stage without `source`.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub store: String,
     /// Whether missing models are skipped too.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tolerate_missing: bool,
@@ -51,10 +56,25 @@ impl Declared for PromoteTask {
 
     fn read(fields: &mut Fields) -> Result<Self, SpecError> {
         Ok(Self {
-            source: fields.required("source")?,
+            source: fields.optional("source")?,
             count: fields.or_default("count")?,
             promote: fields.required("promote")?,
         })
+    }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_zero(n: &u64) -> bool {
+    *n == 0
+}
+
+impl PromoteTask {
+    /// Returns the store of the models.
+    pub fn store(&self) -> &String {
+        match &self.source {
+            Some(source) => &source.store,
+            None => &self.promote.store,
+        }
     }
 }
 
@@ -62,10 +82,11 @@ impl TaskKind for PromoteTask {
     fn io(&self) -> Io<'_> {
         Io {
             version: ("promote.version", &self.promote.version),
-            source: Some(&self.source),
+            source: self.source.as_ref(),
+            models_store: Some(self.store()),
             models: names("promote.among", &self.promote.among),
             makes: Makes::Model {
-                store: &self.source.store,
+                store: self.store(),
                 name: &self.promote.model,
                 training: None,
             },
@@ -74,18 +95,39 @@ impl TaskKind for PromoteTask {
     }
 
     fn io_mut(&mut self) -> IoMut<'_> {
+        let source = self.source.as_mut();
+        let own_store = source.is_none();
         IoMut {
             version: Some(&mut self.promote.version),
-            source: Some((&mut self.source, &mut self.count)),
+            source: source.map(|source| (source, &mut self.count)),
+            stores: match own_store {
+                true => vec![("promote.store", &mut self.promote.store)],
+                false => Vec::new(),
+            },
+            models_in_store: own_store,
             models: ModelNames::List("promote.among", &mut self.promote.among),
             ..IoMut::default()
         }
     }
 
     fn check(&self) -> Result<(), SpecError> {
-        check_source(&self.source)?;
-        check_count("count", self.count)?;
         let settings = &self.promote;
+        match &self.source {
+            Some(source) => {
+                check_source(source)?;
+                check_count("count", self.count)?;
+                if !settings.store.is_empty() {
+                    let what =
+                        "is for stages without source, whose store has the models; remove it";
+                    return Err(SpecError::new("promote.store", what));
+                }
+            }
+            None if settings.store.is_empty() => {
+                let what = "is missing; give a path or URL, or a source";
+                return Err(SpecError::new("promote.store", what));
+            }
+            None => {}
+        }
         check_model("promote.model", &settings.model)?;
         if settings.among.is_empty() || settings.among.len() > MAX_STAGES {
             let what = format!(
@@ -107,7 +149,7 @@ impl TaskKind for PromoteTask {
     fn shaping(&self) -> Value {
         json!({
             "stage": "promote",
-            "source": self.source.shaping(),
+            "source": self.source.as_ref().map(SourceSettings::shaping),
             "settings": self.promote,
         })
     }
@@ -115,12 +157,15 @@ impl TaskKind for PromoteTask {
     fn results(&self) -> Results<'_> {
         let name = &*self.promote.model;
         Results {
-            field: "source.store",
-            store: &self.source.store,
+            field: match self.source {
+                Some(_) => "source.store",
+                None => "promote.store",
+            },
+            store: self.store(),
             folder: format!("{MODELS}/{name}"),
             destination: Destination::folder(
                 "promote.model",
-                &self.source.store,
+                self.store(),
                 format!("{MODELS}/{name}"),
             ),
             manifest: Manifest::Model { name },

@@ -13,6 +13,8 @@ pub mod infer;
 mod part;
 #[cfg(feature = "networks")]
 mod promote;
+#[cfg(feature = "networks")]
+mod python;
 pub mod reconstruct;
 mod render;
 #[cfg(feature = "networks")]

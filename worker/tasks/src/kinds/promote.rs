@@ -2,7 +2,7 @@
 //! byte-for-byte copy of the training's result, and its manifest lists the candidates.
 
 use picofarm_model::metric::Metrics;
-use picofarm_proto::spec::PromoteTask;
+use picofarm_proto::spec::{PromoteTask, TaskKind as _};
 use picofarm_results::{ModelManifest, NewModel, Promoted, TrialRecord};
 use picofarm_store::published::Manifest as _;
 use tracing::info;
@@ -25,8 +25,8 @@ impl RunTask for PromoteTask {
         let task = self;
         let settings = &task.promote;
         let models = stores
-            .models(&task.source.store, control)
-            .map_err(|e| in_field("source.store", e))?;
+            .models(task.store(), control)
+            .map_err(|e| in_field(task.results().field, e))?;
         let (mut best, mut finished): (Option<(f64, ModelManifest)>, u64) = (None, 0);
         for (i, name) in settings.among.iter().enumerate() {
             let field = format!("promote.among[{i}]");
@@ -103,8 +103,16 @@ impl RunTask for PromoteTask {
 }
 
 /// Returns the loss of a model on the validation scenes at the end of its training: MAE in metres,
-/// or 1 − IoU.
+/// or 1 − IoU; for an own training, its objective.
 fn loss(manifest: &ModelManifest) -> Result<f64, TaskError> {
+    if let Some(objective) = manifest.metrics.get("objective") {
+        return objective["loss"].as_f64().ok_or_else(|| {
+            TaskError::User(format!(
+                "{:?} reported no {}; report it at the end of the training",
+                manifest.name, objective["metric"]
+            ))
+        });
+    }
     let found = manifest.metrics.get("validation").cloned();
     let found: Option<Metrics> = found.and_then(|m| serde_json::from_value(m).ok());
     found.map(|m| m.loss()).ok_or_else(|| {

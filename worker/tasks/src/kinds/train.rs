@@ -35,13 +35,11 @@ mod inputs;
 mod plan;
 mod results;
 mod trial;
-mod verdict;
 
 use along::{Reporter, loading};
 use board::Board;
 pub use imported::{ImportFor, NotImported, imported};
 use results::{lines, metrics, output, pretty};
-use trial::{Course, EndedTrial};
 
 use crate::{
     errors::{dataset_error, in_field, model_error},
@@ -52,6 +50,7 @@ use crate::{
     saver::{PIECE, Saver},
     stores::Stores,
     task::{Context, Control, Output, RunTask, Task, TaskError},
+    trial::{Course, EndedTrial, adopted},
 };
 
 impl RunTask for TrainTask {
@@ -78,12 +77,15 @@ impl RunTask for TrainTask {
             };
             return Ok(output(&published.manifest, published.adopted));
         };
-        let mut course = Course::open(stores, &training, trial)?;
+        let mut course = trial::open(stores, &training, trial)?;
         if let Some(ended) = course.ended(force, control)? {
-            return Ok(trial::adopted(&ended));
+            return Ok(adopted(&ended));
         }
         match training.learn(stores, force, Some(&course), control)? {
-            Ok(published) => course.finished(&published.manifest, published.adopted, control),
+            Ok(published) => {
+                let published = (&published.manifest, published.adopted);
+                trial::finished(&course, (stores, &training), published, control)
+            }
             Err(left) => course.left(left, control),
         }
     }
@@ -270,7 +272,8 @@ impl TrainingRun<'_> {
         // Decision on the trial at its latest rung.
         let mut answer = Ok(true);
         let mut ask = |line: &Line, best: Option<f64>| {
-            let goes_on = |course: &Course<'_>| course.goes_on(line, best, epochs, control);
+            let at = trial::at(line, best, epochs);
+            let goes_on = |course: &Course<'_>| course.goes_on(&at, control);
             answer = course.map_or(Ok(true), goes_on);
             matches!(answer, Ok(true))
         };
@@ -309,10 +312,7 @@ impl TrainingRun<'_> {
                 }
             }
         };
-        let left = |training: &Training, end| EndedTrial {
-            end,
-            history: training.position().history.clone(),
-        };
+        let left = |training: &Training, end| trial::ended(end, &training.position().history);
         match ended {
             Err(error @ ModelError::NotFinite { .. }) if course.is_some() => {
                 saver.last();

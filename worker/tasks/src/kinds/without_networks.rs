@@ -3,6 +3,7 @@
 
 use picofarm_proto::spec::{
     EvaluateShardTask, EvaluateTask, InferTask, PromoteTask, ReportTask, TrainTask,
+    kinds::PythonTask,
 };
 
 use crate::task::{Context, Control, Output, RunTask, Task, TaskError, not_built};
@@ -27,5 +28,6 @@ absent!(
     EvaluateTask,
     PromoteTask,
     InferTask,
-    ReportTask
+    ReportTask,
+    PythonTask
 );

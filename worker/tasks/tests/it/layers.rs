@@ -3,14 +3,17 @@
 use std::{fs, path::Path};
 
 /// The modules below `src`, from the bottom layer to the top.
-const LAYERS: [&str; 13] = [
+const LAYERS: [&str; 16] = [
     "errors",
     "memory",
     "submission",
     "stores",
     "saver",
+    "interpreter",
     "task",
     "device",
+    "trial",
+    "python",
     "input",
     "making",
     "repair",

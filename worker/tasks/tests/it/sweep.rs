@@ -35,10 +35,11 @@ fn sweep(place: &Place, sweep: &Value, train: &Value) -> Vec<StageSpec> {
 
 fn promotion(place: &Place, among: &[&str]) -> StageSpec {
     StageSpec::new(TaskSpec::Promote(PromoteTask {
-        source: place.source(),
+        source: Some(place.source()),
         count: SCENES,
         promote: PromoteSettings {
             model: "best".into(),
+            store: String::new(),
             among: among.iter().map(|&name| name.to_owned()).collect(),
             tolerate_missing: false,
             version: model_version(),

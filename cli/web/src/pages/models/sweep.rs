@@ -71,10 +71,10 @@ pub async fn page(app: &App, query: &Query) -> Result<Page, Problem> {
     let link = |sort: &str| format!("{}&{}", path(store, name, id), encode(&[("sort", sort)]));
     let count = |word: &str| trials.iter().filter(|t| t.badge().0 == word).count();
     let kind = sweep.trials.first().map_or("", |trial| &*trial.kind);
-    let error = if kind == "tof" {
-        "validation MAE, m"
-    } else {
-        "validation loss"
+    let error = match kind {
+        "tof" => "validation MAE, m",
+        "python" => "objective",
+        _ => "validation loss",
     };
     let content = html! {
         h1 { (safe(name)) " " span.none { "sweep " code { (safe(short(id))) } } }

@@ -101,7 +101,7 @@ impl TrainSettings {
             return fail("shadow.times", what);
         }
         if let Some(trial) = &self.trial {
-            trial.check()?;
+            trial.check("train.trial")?;
             if self.processes != 1 {
                 let what = format!(
                     "is {}, but a trial of a sweep is one task; leave it out, and let workers take trials side by side",

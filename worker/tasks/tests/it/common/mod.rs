@@ -405,6 +405,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         exit_idle: None,
         ends_at: None,
         asset_dirs: Vec::new(),
+        python: None,
         access: Default::default(),
         store_prefixes: Vec::new(),
     }
