@@ -120,7 +120,10 @@ class Learner:
         self.target = self.plan["question"]["target"]
         self.device = torch.device("cpu")
         if task["gpus"]:
-            self.device = torch.device("cuda", rank % torch.cuda.device_count())
+            if world > torch.cuda.device_count():
+                cards = torch.cuda.device_count()
+                raise ValueError(f"train.processes: {world}, but PyTorch sees {cards} CUDA cards")
+            self.device = torch.device("cuda", rank)
             torch.cuda.set_device(self.device)
         self.half = spec.get("precision", "f32") == "bf16"
         self.network = network(spec).to(self.device)
@@ -154,7 +157,8 @@ class Learner:
         self.network.train()
         for part in self.frozen:
             part.eval()
-        norms = (m for m in self.network.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm))
+        every = self.network.modules()
+        norms = [m for m in every if isinstance(m, nn.modules.batchnorm._BatchNorm)]
         self.norms = [norm for norm in norms if norm.training]
 
     def load(self, path, steps):
@@ -331,7 +335,8 @@ def start():
         return main()
     from torch.distributed.run import main as run
 
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (sys.path[0], os.environ.get("PYTHONPATH"))))
+    paths = (sys.path[0], os.environ.get("PYTHONPATH"))
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     # All processes are on this machine.
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     run(["--standalone", "--nproc-per-node", str(processes), "-m", __name__])
