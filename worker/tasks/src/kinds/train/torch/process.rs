@@ -115,6 +115,8 @@ impl Processes {
             ),
             ("PICOFARM_TORCH_PROCESSES".to_owned(), count.to_string()),
             ("OMP_NUM_THREADS".to_owned(), threads.to_string()),
+            // Threads that wait must not keep this worker from preparing scenes.
+            ("OMP_WAIT_POLICY".to_owned(), "PASSIVE".to_owned()),
         ];
         let control = Arc::new(Control::default());
         let (interpreter, theirs) = (interpreter.clone(), Arc::clone(&control));
