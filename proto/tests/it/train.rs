@@ -328,6 +328,16 @@ fn an_unusable_field_is_named() {
             "expected 1 to 2",
         ),
         (
+            "target = \"tof\", model = \"m\", runtime = \"torch\", processes = 4, optimise = { batch = 36, accumulate = 6 }",
+            "train.processes",
+            "does not divide optimise.accumulate = 6",
+        ),
+        (
+            "target = \"tof\", model = \"m\", torch = { compile = true }",
+            "train.torch",
+            "remove it",
+        ),
+        (
             "target = \"tof\", model = \"m\", processes = 0",
             "train.processes",
             "expected 1 to 1",

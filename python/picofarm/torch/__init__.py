@@ -20,14 +20,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import nn
-from torch.nn import functional as F
 
 from .._data import Dataset, Stream
 from .._farm import run
-from ._embeddings import Embeddings
-from ._nlost import Nlost
-from ._swinir import SwinIR
-from ._unets import Unet2d, Unet25d
+from ._networks import ARCHITECTURES, Embeddings, Nlost, SwinIR, Unet2d, Unet25d, loss, network
 
 __all__ = [
     "ARCHITECTURES",
@@ -45,39 +41,6 @@ __all__ = [
     "normalised",
     "shadow_transient",
 ]
-
-ARCHITECTURES: dict[str, type[nn.Module]] = {
-    "unet2d": Unet2d,
-    "unet25d": Unet25d,
-    "swinir": SwinIR,
-    "embeddings": Embeddings,
-    "nlost": Nlost,
-}
-"""Networks by the names that job files use."""
-
-
-def network(spec: Mapping[str, Any]) -> nn.Module:
-    """Returns an untrained network.
-
-    Args:
-        spec: `architecture`, `dense` (channels of the input: bins), `one_hot` (bins of the shadow
-            transient, 0 without it), `outputs`, and the fields of `net` in a job file.
-            `picofarm model show --json` prints that of a trained network.
-
-    Raises:
-        ValueError: The architecture is unknown.
-    """
-    name = spec.get("architecture")
-    if name not in ARCHITECTURES:
-        known = ", ".join(ARCHITECTURES)
-        raise ValueError(f"architecture: expected one of {known}, found {name!r}")
-    whole = {"width": 128, "levels": 6, "stem": 0, "time": 0, "one_hot": 0, "outputs": 1, **spec}
-    module = ARCHITECTURES[name](whole)
-    if spec.get("added", False):
-        # A network over evidence corrects the log odds in the last channel.
-        module.register_forward_hook(lambda _, inputs, output: output + inputs[0][:, -1:])
-    return module
-
 
 class Model(nn.Module):
     """A trained network with its input form."""
@@ -183,16 +146,6 @@ def shadow_transient(bin_index: ArrayLike, bins: int) -> torch.Tensor:
     """
     index = torch.as_tensor(np.asarray(bin_index, np.int64))
     return (index[..., None, :, :] == torch.arange(bins)[:, None, None]).float()
-
-
-def loss(target: str, output: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """Returns the loss of the paper: L1 for `tof`, cross-entropy for `shadow` and `specular`.
-
-    `truth` is z-depth over `depth_scale_m`, or a mask.
-    """
-    if target == "tof":
-        return F.l1_loss(output, truth)
-    return F.binary_cross_entropy_with_logits(output, truth)
 
 
 def metrics(target: str, predicted: ArrayLike, truth: ArrayLike) -> dict[str, float]:

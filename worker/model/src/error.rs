@@ -64,6 +64,9 @@ pub enum ModelError {
         /// The failure, in the driver's words if it gave any.
         what: String,
     },
+    /// A failure of the program that computes a training's steps.
+    #[error("{0}")]
+    Engine(String),
     /// The reason why a process cannot train together with others.
     #[error("{0}")]
     Group(String),

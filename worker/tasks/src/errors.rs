@@ -52,6 +52,7 @@ pub(crate) fn model_error(error: ModelError) -> TaskError {
         // Stored objects have checksums, so this program wrote a value that it cannot read.
         ModelError::Weights { what } | ModelError::File { what } => TaskError::Crash(what),
         ModelError::Group(what) => TaskError::Interrupted(what),
+        ModelError::Engine(what) => TaskError::Crash(what),
         error @ ModelError::Gpu { .. } => TaskError::Crash(error.to_string()),
         other => TaskError::User(other.to_string()),
     }

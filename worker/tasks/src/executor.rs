@@ -19,13 +19,15 @@ use picofarm_settings::Gpus;
 use tokio::runtime::Handle;
 
 #[cfg(feature = "networks")]
-use crate::{device, interpreter::Interpreter};
+use crate::{device, interpreter::Interpreter, kinds::train::has_torch};
 use crate::{
     input::scenes,
     stores::{STORE_PATIENCE, Stores},
     submission::Submission,
     task::{Context, Control, Latest, Output, RunTask, Task, TaskError, not_built},
 };
+#[cfg(feature = "networks")]
+use picofarm_proto::spec::train::TORCH;
 
 /// Address of workers that only workers of the same machine can reach.
 #[cfg(feature = "networks")]
@@ -134,6 +136,8 @@ impl TaskExecutor {
             #[cfg(feature = "networks")]
             gpus: Vec::new(),
             #[cfg(feature = "networks")]
+            torch: None,
+            #[cfg(feature = "networks")]
             models: Latest::default(),
             #[cfg(feature = "networks")]
             python: None,
@@ -201,6 +205,7 @@ impl TaskExecutor {
                 path.display(),
                 found.version()
             );
+            self.0.torch = has_torch(&found).then(|| found.clone());
             self.0.python = Some(found);
             Ok(self)
         }
@@ -237,10 +242,17 @@ impl Executor for TaskExecutor {
             .filter(|(kind, version)| !version.is_empty() && self.runs(kind));
         let parts = PARTS.iter().filter(|(_, _, built)| *built);
         let parts = parts.map(|(kind, part, _)| (format!("{kind}:{part}"), version(kind)));
-        built
+        #[cfg_attr(not(feature = "networks"), expect(unused_mut))]
+        let mut kinds: BTreeMap<String, String> = built
             .map(|(kind, version)| (kind.to_owned(), version))
             .chain(parts)
-            .collect()
+            .collect();
+        #[cfg(feature = "networks")]
+        if self.0.torch.is_some() {
+            let train = TrainTask::NAME;
+            kinds.insert(format!("{train}:{TORCH}"), version(train));
+        }
+        kinds
     }
 
     fn gpus(&self) -> Vec<String> {

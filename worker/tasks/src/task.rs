@@ -56,6 +56,9 @@ pub(crate) struct Context {
     /// GPUs that tasks may use.
     #[cfg(feature = "networks")]
     pub gpus: Vec<OpenGpu>,
+    /// The Python interpreter for trainings by PyTorch, if it has PyTorch.
+    #[cfg(feature = "networks")]
+    pub torch: Option<Interpreter>,
     /// The models that the latest inference used.
     #[cfg(feature = "networks")]
     pub models: Latest<Models>,

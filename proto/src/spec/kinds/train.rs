@@ -30,14 +30,19 @@ pub use super::names::check_model;
 pub(super) use check::check_spots;
 pub(super) use settings::is_zero;
 pub use settings::{
-    InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
-    SpecularSettings, TRUTH, TrainSettings,
+    InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, Runtime,
+    ShadowSettings, SpecularSettings, TRUTH, TorchSettings, TrainSettings,
 };
 
 /// The field of [`ShadowSettings::times`].
 const TIMES: &str = "train.shadow.times";
 
-/// Trains a network: one task for each process.
+/// The ability to train by PyTorch.
+pub const TORCH: &str = "torch";
+/// Memory of a process with PyTorch and nothing else, in bytes.
+const TORCH_BYTES: f64 = 600e6;
+
+/// Trains a network: one task for each process, or one for all processes of PyTorch.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrainTask {
     /// The training data set. The model is stored in the same store.
@@ -141,14 +146,15 @@ impl TaskKind for TrainTask {
             true => source.evidence(),
             false => 0.0,
         };
-        Some(
-            BASE + source.two()
-                + sensed
-                + 2.0 * evidence
-                + learns
-                + sums
-                + others.fold(0.0, f64::max),
-        )
+        let by = match self.train.runtime {
+            Runtime::Embedded => learns + sums,
+            // This worker has the weights too.
+            Runtime::Torch => {
+                let each = learns + (2.0 + f64::from(average)) * ours.weights() + TORCH_BYTES;
+                4.0 * ours.weights() + each * f64::from(self.train.processes)
+            }
+        };
+        Some(BASE + source.two() + sensed + 2.0 * evidence + by + others.fold(0.0, f64::max))
     }
 
     /// The folder of two-bounce times must have depths or evidence. Spots that are known by their
@@ -173,9 +179,12 @@ impl TaskKind for TrainTask {
 
     fn dispatch(&self) -> Dispatch {
         Dispatch {
-            tasks: u64::from(self.train.processes),
+            tasks: match self.train.runtime {
+                Runtime::Embedded => u64::from(self.train.processes),
+                Runtime::Torch => 1,
+            },
             resumes: true,
-            ..Dispatch::default()
+            variant: (self.train.runtime == Runtime::Torch).then_some(TORCH),
         }
     }
 }

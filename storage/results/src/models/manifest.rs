@@ -70,6 +70,10 @@ pub struct Lineage {
     /// If it is a promoted copy of another model, how it was selected.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub promoted: Option<Promoted>,
+    /// If another program than picofarm computed the training: its name, versions and device. The
+    /// same training then gives similar weights, not the same bits.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub runtime: BTreeMap<String, String>,
 }
 
 /// The predicted depths that were used.

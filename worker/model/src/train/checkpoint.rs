@@ -85,6 +85,19 @@ impl Snapshot {
         Self { header, tensors }
     }
 
+    /// Returns the snapshot with the tensors of an engine, by prefix.
+    pub(super) fn replaced(mut self, parts: BTreeMap<String, Named>) -> Self {
+        let device = crate::cpu();
+        for (part, named) in parts {
+            for (name, (shape, value)) in named {
+                let value = upload(value, &device);
+                self.tensors
+                    .insert(format!("{part}/{name}"), (shape, value));
+            }
+        }
+        self
+    }
+
     /// Returns the checkpoint as safetensors of at most `most` bytes each, excluding their headers.
     /// A tensor larger than `most` has a piece of its own. The first piece contains the training's
     /// position.

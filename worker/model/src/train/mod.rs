@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod clock;
+mod engine;
 mod event;
 mod gradients;
 pub mod group;
@@ -18,6 +19,7 @@ mod validate;
 use serde::{Deserialize, Serialize};
 
 pub use checkpoint::{Snapshot, left_by};
+pub use engine::Engine;
 pub use event::{Control, Ended, Event, Sources, Trained};
 pub use gradients::Gradients;
 pub use learner::{Learner, predict};

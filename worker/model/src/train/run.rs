@@ -1,6 +1,6 @@
 //! Runs a training from its current position to its end.
 
-use std::{ops::Range, sync::Arc, time::Instant};
+use std::{cell::RefCell, ops::Range, sync::Arc, time::Instant};
 
 use burn::tensor::Device;
 
@@ -8,10 +8,11 @@ use super::{
     Plan,
     checkpoint::{self, Snapshot},
     clock::Clock,
+    engine::Engine,
     event::{Control, Ended, Event, Sources, Trained},
     gradients::Gradients,
     group::{Group, Member, Next, Standing},
-    learner::Learner,
+    learner::{Brought, Learner},
     load::{Course, Loading, Making, Ready},
     position::Position,
     schedule,
@@ -29,6 +30,8 @@ pub struct Training {
     pub(super) loading: Loading,
     device: Device,
     pub(super) leads: bool,
+    /// The program that computes the steps, if it is not this one.
+    pub(super) engine: Option<RefCell<Box<dyn Engine>>>,
 }
 
 impl Training {
@@ -70,6 +73,7 @@ impl Training {
             loading: Loading::default(),
             device: device.clone(),
             leads: true,
+            engine: None,
         })
     }
 
@@ -99,6 +103,7 @@ impl Training {
             loading: Loading::default(),
             device: device.clone(),
             leads: true,
+            engine: None,
         })
     }
 
@@ -111,7 +116,20 @@ impl Training {
     }
 
     /// Returns the training's current state, which can be written while it continues.
-    pub fn snapshot(&self) -> Snapshot {
+    ///
+    /// # Errors
+    /// Those of the engine, if there is one.
+    pub fn snapshot(&self) -> Result<Snapshot, ModelError> {
+        let Some(engine) = &self.engine else {
+            return Ok(self.own_snapshot());
+        };
+        let state = engine.borrow_mut().state(true)?;
+        let part = self.plan.question.part();
+        let parts = self.learner.parts_of(&state, part)?;
+        Ok(self.own_snapshot().replaced(parts))
+    }
+
+    fn own_snapshot(&self) -> Snapshot {
         Snapshot::take(
             &self.learner,
             &self.position,
@@ -120,9 +138,10 @@ impl Training {
         )
     }
 
-    /// Returns the training's state as bytes, from which it can resume.
+    /// Returns the training's state as bytes, from which it can resume. An engine's state is not in
+    /// it: see [`Self::snapshot`].
     pub fn checkpoint(&self) -> Vec<u8> {
-        let mut pieces = self.snapshot().pieces(usize::MAX);
+        let mut pieces = self.own_snapshot().pieces(usize::MAX);
         pieces.next().expect("there is a first piece")
     }
 
@@ -156,9 +175,12 @@ impl Training {
         &mut self,
         say: &mut dyn FnMut(&Self, &Event) -> Control,
     ) -> Result<Ended, ModelError> {
+        if let Some(engine) = &self.engine {
+            engine.borrow_mut().rewind();
+        }
         let share = 0..self.plan.accumulate;
-        self.go(&share, None, say)
-            .map(|ended| ended.expect("nobody else is lost"))
+        let ended = self.go(&share, None, say)?;
+        Ok(ended.expect("nobody else is lost"))
     }
 
     /// Like [`Self::run`], but together with other processes. The result has the same bits.
@@ -235,40 +257,21 @@ impl Training {
                 {
                     return Ok(None);
                 }
-                let mut others = group.as_deref_mut().filter(|group| !group.is_alone());
-                let mut sum = Gradients::default();
-                let mut last = None;
-                for at in share.clone() {
-                    let mut next = || {
-                        let since = Instant::now();
-                        let batch = ready.next()?;
-                        clock.waited += since.elapsed();
-                        Ok::<_, ModelError>(self.learner.bring(batch))
-                    };
-                    let batch = ahead.take().map_or_else(&mut next, Ok)?;
-                    if others.is_some() && at + 1 == share.end {
-                        last = Some((at, batch));
-                        break;
+                let loss = match self.engine.take() {
+                    Some(engine) => {
+                        let loss = self.step_outside(&engine, ready, &mut clock);
+                        self.engine = Some(engine);
+                        loss?
                     }
-                    self.learner.add(&mut sum, at, batch)?;
-                    if self.learner.computes_apart() && !ready.is_over() {
-                        ahead = Some(next()?);
+                    None => {
+                        let parts = (share, &mut group, &mut ahead);
+                        match self.step_here(ready, parts, &mut clock)? {
+                            Some(loss) => loss,
+                            None => return Ok(None),
+                        }
                     }
-                }
-                if let Some(group) = &mut others {
-                    let mut own = Some((sum, last));
-                    let whole = group.sum(self.learner.steps(), &mut |each| {
-                        let (sum, last) = own.take().expect("computed once");
-                        self.learner.parts(sum, last, each)
-                    })?;
-                    let Some(whole) = whole else {
-                        return Ok(None);
-                    };
-                    sum = self.learner.gradients_of(whole, batches)?;
-                }
+                };
                 clock.samples += batches * self.plan.batch;
-                let pace = self.pace(self.learner.steps());
-                let loss = self.learner.finish(sum, batches, pace)?;
                 let position = &mut self.position;
                 position.batches += batches as u64;
                 position.losses += f64::from(loss);
@@ -299,7 +302,56 @@ impl Training {
                 }
             }
         }
+        self.mirror()?;
         Ok(Some(Ended::Finished))
+    }
+
+    /// Takes a step with this crate's networks, and returns its loss, or `None` if the group has
+    /// changed. `ahead` is the next batch, transferred to a graphics processor while it computes.
+    fn step_here(
+        &mut self,
+        ready: &Ready<'_>,
+        (share, group, ahead): (
+            &Range<usize>,
+            &mut Option<&mut (dyn Group + '_)>,
+            &mut Option<Brought>,
+        ),
+        clock: &mut Clock,
+    ) -> Result<Option<f32>, ModelError> {
+        let batches = self.plan.accumulate;
+        let mut others = group.as_deref_mut().filter(|group| !group.is_alone());
+        let mut sum = Gradients::default();
+        let mut last = None;
+        for at in share.clone() {
+            let mut next = || {
+                let since = Instant::now();
+                let batch = ready.next()?;
+                clock.waited += since.elapsed();
+                Ok::<_, ModelError>(self.learner.bring(batch))
+            };
+            let batch = ahead.take().map_or_else(&mut next, Ok)?;
+            if others.is_some() && at + 1 == share.end {
+                last = Some((at, batch));
+                break;
+            }
+            self.learner.add(&mut sum, at, batch)?;
+            if self.learner.computes_apart() && !ready.is_over() {
+                *ahead = Some(next()?);
+            }
+        }
+        if let Some(group) = &mut others {
+            let mut own = Some((sum, last));
+            let whole = group.sum(self.learner.steps(), &mut |each| {
+                let (sum, last) = own.take().expect("computed once");
+                self.learner.parts(sum, last, each)
+            })?;
+            let Some(whole) = whole else {
+                return Ok(None);
+            };
+            sum = self.learner.gradients_of(whole, batches)?;
+        }
+        let pace = self.pace(self.learner.steps());
+        self.learner.finish(sum, batches, pace).map(Some)
     }
 
     /// Returns the optimiser's settings at a step.

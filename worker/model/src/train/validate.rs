@@ -47,21 +47,29 @@ impl Training {
             position.batches = 0;
         }
         if let Some(loss) = validation.map(|m| m.loss()) {
-            // A NaN or infinite loss is never the best.
-            if loss.is_finite() && position.best.is_none_or(|best| loss < best) {
-                position.best = Some(loss);
-                position.since_best = 0;
-                if self.plan.early_stop > 0 {
-                    position.kept_step = line.step;
-                    self.kept = Some(self.learner.kept().clone());
-                }
-            } else {
-                position.since_best += 1;
-            }
-            let patience = self.plan.early_stop;
-            position.stopped_early = patience > 0 && position.since_best >= patience;
+            self.judge(loss, line.step)?;
         }
         Ok(Some(line))
+    }
+
+    /// Compares a validation with the best one so far.
+    fn judge(&mut self, loss: f64, step: u64) -> Result<(), ModelError> {
+        let better = self.position.best.is_none_or(|best| loss < best);
+        // A NaN or infinite loss is never the best.
+        if loss.is_finite() && better {
+            self.position.best = Some(loss);
+            self.position.since_best = 0;
+            if self.plan.early_stop > 0 {
+                self.position.kept_step = step;
+                self.mirror()?;
+                self.kept = Some(self.learner.kept().clone());
+            }
+        } else {
+            self.position.since_best += 1;
+        }
+        let patience = self.plan.early_stop;
+        self.position.stopped_early = patience > 0 && self.position.since_best >= patience;
+        Ok(())
     }
 
     /// Returns the line of the current position, with metrics on the validation scenes.
@@ -109,7 +117,7 @@ impl Training {
         making.ahead(|ready| {
             for at in 0..scenes.len().div_ceil(self.plan.batch) {
                 let batch = ready.next()?;
-                let said = self.learner.predict(&batch);
+                let said = self.predict(&batch)?;
                 if let Some(odd) = said.iter().position(|value| !value.is_finite()) {
                     let scene = at * self.plan.batch + odd / (said.len() / batch.images.max(1));
                     let step = self.learner.steps();

@@ -15,13 +15,16 @@ use bytes::Bytes;
 use picofarm_dataset::DatasetSpec;
 use picofarm_members::Members;
 use picofarm_model::{
-    Device, ModelError,
+    Device, ModelError, cpu,
     input::EvidenceForm,
     memory::RetainedMemory,
     scene::Scenes,
     train::{Ended, Event, Line, Plan, Sources, Trained, Training},
 };
-use picofarm_proto::spec::{TrainSettings, TrainTask, train::Normalise};
+use picofarm_proto::spec::{
+    TrainSettings, TrainTask,
+    train::{Normalise, Runtime},
+};
 use picofarm_results::{
     Lineage, ModelManifest, Models, NewModel, PublishedModel, TrainingSpeed, TrialEnd,
 };
@@ -34,12 +37,15 @@ mod imported;
 mod inputs;
 mod plan;
 mod results;
+mod torch;
 mod trial;
 
 use along::{Reporter, loading};
 use board::Board;
 pub use imported::{ImportFor, NotImported, imported};
 use results::{lines, metrics, output, pretty};
+use torch::TorchEngine;
+pub(crate) use torch::has_torch;
 
 use crate::{
     errors::{dataset_error, in_field, model_error},
@@ -47,6 +53,7 @@ use crate::{
         examples::Examples,
         models::{Known, WEIGHTS, expected_input, model_version},
     },
+    interpreter::Interpreter,
     saver::{PIECE, Saver},
     stores::Stores,
     task::{Context, Control, Output, RunTask, Task, TaskError},
@@ -68,6 +75,7 @@ impl RunTask for TrainTask {
             device: context.device(task)?,
             gpu: context.gpu(task).map(ToString::to_string),
             peers: &context.peers,
+            python: context.torch.as_ref(),
             ..TrainingRun::open(stores, self, control)?
         };
         let Some(trial) = &self.train.trial else {
@@ -112,6 +120,8 @@ struct TrainingRun<'a> {
     gpu: Option<String>,
     /// Address at which other workers reach this one.
     peers: &'a str,
+    /// The Python interpreter of this worker, if it has PyTorch.
+    python: Option<&'a Interpreter>,
 }
 
 impl TrainingRun<'_> {
@@ -167,11 +177,19 @@ impl TrainingRun<'_> {
         let asked = expected_input(&plan, &self.spec);
         let board = Board::new(stores, self, control);
         let stopped = || control.stopped();
-        let mut members = match self.task.train.processes {
-            1 => None,
+        let settings = self.settings();
+        let mut members = match (settings.runtime, settings.processes) {
+            (Runtime::Torch, _) | (_, 1) => None,
             _ => Some(board.members(self.peers, &stopped)?),
         };
-        let trained = match self.train(plan, stores, (course, members.as_mut()), control)? {
+        let engine = match settings.runtime {
+            Runtime::Embedded => None,
+            Runtime::Torch => Some(self.engine(&plan)?),
+        };
+        let mut lineage = self.lineage.clone();
+        lineage.runtime = engine.as_ref().map(|e| self.runtime(e)).unwrap_or_default();
+        let parts = (course, members.as_mut(), engine);
+        let trained = match self.train(plan, stores, parts, control)? {
             Outcome::Trained(trained) => trained,
             Outcome::Pruned(left) => return Ok(Err(left)),
             Outcome::TrainedElsewhere => {
@@ -194,7 +212,7 @@ impl TrainingRun<'_> {
                 training_key: key.clone(),
                 settings: self.task.train.shaping(),
                 plan: asked,
-                lineage: self.lineage.clone(),
+                lineage,
                 metrics: metrics.clone(),
                 ..ModelManifest::default()
             },
@@ -239,9 +257,17 @@ impl TrainingRun<'_> {
         &self,
         plan: Plan,
         stores: &Stores,
-        (course, members): (Option<&Course<'_>>, Option<&mut Members<'_>>),
+        (course, members, engine): (
+            Option<&Course<'_>>,
+            Option<&mut Members<'_>>,
+            Option<TorchEngine>,
+        ),
         control: &Control,
     ) -> Result<Outcome, TaskError> {
+        let device = match engine {
+            None => self.device.clone(),
+            Some(_) => cpu(),
+        };
         let (name, key) = (&self.task.train.model, &*self.key);
         let sources = Sources {
             train: self.training.clone(),
@@ -252,14 +278,17 @@ impl TrainingRun<'_> {
         let from = from.map(|known| &known.weights[..]);
         let newest = stores.wait(control, self.models.newest_checkpoint(name, key))?;
         let mut training = match newest {
-            None => Training::start(plan, from, sources, &self.device),
+            None => Training::start(plan, from, sources, &device),
             Some((step, content)) => {
                 info!("goes on from the checkpoint after {step} steps");
-                Training::resume(plan, &content, sources, &self.device)
+                Training::resume(plan, &content, sources, &device)
             }
         }
         .map_err(model_error)?
         .loading(loading(self.left_mib));
+        if let Some(engine) = engine {
+            training = training.on(Box::new(engine)).map_err(model_error)?;
+        }
         let checkpoints = self
             .models
             .checkpoints_of(name, key)
@@ -271,6 +300,7 @@ impl TrainingRun<'_> {
         let mut teller = Reporter::new(control, epochs);
         // Decision on the trial at its latest rung.
         let mut answer = Ok(true);
+        let mut unsaved = Ok(());
         let mut ask = |line: &Line, best: Option<f64>| {
             let at = trial::at(line, best, epochs);
             let goes_on = |course: &Course<'_>| course.goes_on(&at, control);
@@ -296,7 +326,10 @@ impl TrainingRun<'_> {
                     }
                     if training.leads() && saved.elapsed() >= every && !saver.is_busy() {
                         saved = Instant::now();
-                        save(&mut saver, training);
+                        unsaved = save(&mut saver, training);
+                        if unsaved.is_err() {
+                            return picofarm_model::train::Control::Stop;
+                        }
                         if every.is_zero() {
                             // Finishes the save in progress, so that at most the steps since this
                             // checkpoint can be lost.
@@ -313,7 +346,7 @@ impl TrainingRun<'_> {
             }
         };
         let left = |training: &Training, end| trial::ended(end, &training.position().history);
-        match ended {
+        match unsaved.and(ended) {
             Err(error @ ModelError::NotFinite { .. }) if course.is_some() => {
                 saver.last();
                 Ok(Outcome::Pruned(left(
@@ -339,7 +372,7 @@ impl TrainingRun<'_> {
             }
             Ok(Ended::Stopped) => {
                 if training.leads() {
-                    save(&mut saver, &training);
+                    save(&mut saver, &training).map_err(model_error)?;
                 }
                 saver.last();
                 // If the store was unreachable at a rung, the trial resumes from there.
@@ -350,9 +383,10 @@ impl TrainingRun<'_> {
 }
 
 /// Saves the current state of a training in the background.
-fn save(saver: &mut Saver<'_>, training: &Training) {
-    let pieces = training.snapshot().pieces(PIECE).map(Bytes::from);
+fn save(saver: &mut Saver<'_>, training: &Training) -> Result<(), ModelError> {
+    let pieces = training.snapshot()?.pieces(PIECE).map(Bytes::from);
     saver.save(training.learner().steps(), Box::new(pieces));
+    Ok(())
 }
 
 /// Outcome of a training on this process.

@@ -5,8 +5,8 @@ use picofarm_settings::{
 };
 
 use super::settings::{
-    InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
-    TrainSettings, is_of_rooms,
+    InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, Runtime,
+    ShadowSettings, TorchSettings, TrainSettings, is_of_rooms,
 };
 use crate::spec::{
     kinds::{
@@ -102,7 +102,7 @@ impl TrainSettings {
         }
         if let Some(trial) = &self.trial {
             trial.check("train.trial")?;
-            if self.processes != 1 {
+            if self.processes != 1 && self.runtime == Runtime::Embedded {
                 let what = format!(
                     "is {}, but a trial of a sweep is one task; leave it out, and let workers take trials side by side",
                     self.processes
@@ -118,6 +118,7 @@ impl TrainSettings {
             );
             return fail("processes", what);
         }
+        self.check_torch()?;
         self.input.check()?;
         self.net.check()?;
         if let Some(sensor) = &self.sensor {
@@ -151,6 +152,32 @@ impl TrainSettings {
 }
 
 impl TrainSettings {
+    /// Checks the settings of PyTorch.
+    fn check_torch(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("train.{field}"), what));
+        if self.runtime == Runtime::Torch {
+            let parts = self.optimise.accumulate;
+            return match parts.is_multiple_of(self.processes) {
+                true => Ok(()),
+                false => fail(
+                    "processes",
+                    format!(
+                        "is {}, which does not divide optimise.accumulate = {parts}: with runtime = \"torch\" each process has as \
+                         many parts of a batch",
+                        self.processes
+                    ),
+                ),
+            };
+        }
+        match self.torch == TorchSettings::default() {
+            true => Ok(()),
+            false => fail(
+                "torch",
+                "is for runtime = \"torch\"; set that, or remove it".into(),
+            ),
+        }
+    }
+
     /// Checks a network that takes the evidence of a demultiplex stage in place of histograms.
     fn check_evidence(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: &str| Err(SpecError::new(format!("train.{field}"), what));

@@ -74,9 +74,16 @@ pub struct TrainSettings {
     /// random weights.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub from: String,
-    /// Processes that train the network together, each a task for any worker. They share the
-    /// `accumulate` parts of each batch. They come and go with their workers, and the result is
-    /// bit-identical for any number of them. Default 1.
+    /// The program that computes the network.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub runtime: Runtime,
+    /// Settings of PyTorch; only for `runtime = "torch"`.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub torch: TorchSettings,
+    /// Processes that train the network together. They share the `accumulate` parts of each batch.
+    /// With `runtime = "embedded"` each is a task for any worker: they come and go with their
+    /// workers, and the result is bit-identical for any number of them. With `runtime = "torch"`
+    /// all are on one worker, and their number must divide `accumulate`. Default 1.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub processes: u32,
     /// Minutes between checkpoints. A worker's death loses at most this much, plus the time to
@@ -91,6 +98,27 @@ pub struct TrainSettings {
     /// omitted.
     #[serde(default)]
     pub version: String,
+}
+
+/// The program that computes a network in training.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Runtime {
+    /// The worker itself. The same settings give the same bits on every CPU.
+    #[default]
+    Embedded,
+    /// PyTorch, in Python processes of workers that were started with `--python`. The same settings
+    /// give similar weights, not the same bits.
+    Torch,
+}
+
+/// Settings of PyTorch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TorchSettings {
+    /// Whether `torch.compile` translates the network before it is trained. It needs a C++ compiler
+    /// on the worker, and takes minutes at the start.
+    pub compile: bool,
 }
 
 /// The form of a histogram as network input.

@@ -111,6 +111,7 @@ impl<'a> TrainingRun<'a> {
                 .collect(),
             times: times.used(depths.as_ref()),
             promoted: None,
+            runtime: BTreeMap::new(),
         };
         Ok(Self {
             task,
@@ -128,6 +129,7 @@ impl<'a> TrainingRun<'a> {
             device: cpu(),
             gpu: None,
             peers: "",
+            python: None,
         })
     }
 }
