@@ -158,7 +158,10 @@ impl OwnTraining<'_> {
                 self.stores
                     .wait(self.control, self.models.delete_checkpoints(name, key))?;
                 self.control.at(1.0);
-                Ok(Finished::Published(published.manifest.into(), published.adopted))
+                Ok(Finished::Published(
+                    published.manifest.into(),
+                    published.adopted,
+                ))
             }
         }
     }
