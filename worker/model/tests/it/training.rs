@@ -504,7 +504,7 @@ fn pieces_of_a_checkpoint_are_as_small_as_asked_and_give_the_bits_of_the_whole()
     };
     stop_at(&mut training, 2).unwrap();
     let whole = training.checkpoint();
-    let snapshot = training.snapshot();
+    let snapshot = training.snapshot().unwrap();
     // The training continues before the snapshot is written, in place for tensors that are not
     // shared.
     stop_at(&mut training, 3).unwrap();
