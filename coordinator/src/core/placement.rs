@@ -28,6 +28,17 @@ pub fn lacks_memory(stage: &StageSpec, known: &Known, worker: &Abilities) -> Opt
     (there > 0 && needed > there).then_some((needed, there))
 }
 
+/// The reason why a worker without an ability gets no task that needs it.
+fn lacks(ability: &str) -> String {
+    match ability {
+        "python" => "the worker runs no Python code of jobs; start one with --python PATH".into(),
+        "train:torch" => {
+            "the worker trains nothing by PyTorch; start one with --python PATH, of a Python that has PyTorch".into()
+        }
+        _ => format!("the worker runs no {ability} tasks"),
+    }
+}
+
 /// Checks whether a worker may run a stage's tasks. `known` contains the known properties of its
 /// inputs.
 ///
@@ -37,11 +48,7 @@ pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(
     let (kind, version) = (stage.task.kind(), stage.task.version());
     let ability = stage.task.ability();
     match worker.kinds.get(&*ability) {
-        None if kind == "python" => {
-            let what = "the worker runs no Python code of jobs; start one with --python PATH";
-            return Err(what.into());
-        }
-        None => return Err(format!("the worker runs no {ability} tasks")),
+        None => return Err(lacks(&ability)),
         Some(theirs) if theirs != version => {
             return Err(format!(
                 "the job needs {} {version:?}, the worker has {theirs:?}",
