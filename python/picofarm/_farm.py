@@ -243,9 +243,13 @@ class LocalFarm(Client):
     the interpreter is killed. Unfinished jobs continue when a farm starts in the same folder.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], workers: int, gpus: int) -> None:
+    def __init__(
+        self, folder: str | os.PathLike[str], workers: int, gpus: int, python: str | None
+    ) -> None:
         command = ["up", "--no-web", "--dir", os.fspath(folder), "--listen", "127.0.0.1:0"]
         command += ["--workers", str(workers), "--gpus", str(gpus)]
+        if python is not None:
+            command += ["--python", python]
         # Standard input stays open as long as this process lives.
         self._process = subprocess.Popen(
             [sys.executable, "-m", "picofarm._attached", "--json", *command],
@@ -300,7 +304,11 @@ class LocalFarm(Client):
 
 
 def local(
-    folder: str | os.PathLike[str] = "picofarm-data", *, workers: int = 1, gpus: int = 0
+    folder: str | os.PathLike[str] = "picofarm-data",
+    *,
+    workers: int = 1,
+    gpus: int = 0,
+    python: str | os.PathLike[str] | bool = False,
 ) -> LocalFarm:
     """Starts a farm on this machine and returns its client.
 
@@ -311,11 +319,14 @@ def local(
         folder: Where the farm keeps its catalog. A farm in the same folder continues the jobs.
         workers: Number of workers; they share the cores.
         gpus: Number of graphics processors, divided among the workers.
+        python: Interpreter for stages of kind `python` and trainings by PyTorch; `True` is this
+            one. Without it, the farm runs no Python code of jobs.
 
     Raises:
         FarmError: The folder is in use or cannot be written.
     """
-    return LocalFarm(folder, int(workers), int(gpus))
+    interpreter = sys.executable if python is True else os.fspath(python) if python else None
+    return LocalFarm(folder, int(workers), int(gpus), interpreter)
 
 
 class Sweep:

@@ -195,10 +195,10 @@ fn the_notebooks_of_the_documentation_run() {
         .map(|entry| entry.unwrap().path().display().to_string())
         .collect();
     notebooks.sort();
-    assert_eq!(notebooks.len(), 4, "{notebooks:?}");
+    assert_eq!(notebooks.len(), 5, "{notebooks:?}");
     let notebooks: Vec<&str> = notebooks.iter().map(String::as_str).collect();
     let ended = run(&python, &cli, "tests/interop/run_notebooks.py", &notebooks);
-    assert_eq!(ended.stdout.matches(": ran").count(), 4, "{}", ended.stdout);
+    assert_eq!(ended.stdout.matches(": ran").count(), 5, "{}", ended.stdout);
 }
 
 #[test]
