@@ -12,7 +12,7 @@ set -eu
 cd "$1"
 start() {
   date +%s >"$1.started"
-  PICOFARM_ALLOCATION=$1 setsid sh -c 'bash "$0.sh" >"$0.stderr" 2>&1; : >"$0.ended"' "$1" </dev/null >/dev/null 2>&1 &
+  PICOFARM_ALLOCATION=$1 setsid sh -c 'trap : TERM; bash "$0.sh" >"$0.stderr" 2>&1; : >"$0.ended"' "$1" </dev/null >/dev/null 2>&1 &
   echo $! >"$1.group"
 }
 each() { # each ID STATE of what has not ended
@@ -33,6 +33,8 @@ submit)
   echo "$id"
   ;;
 list)
+  until mkdir lock 2>/dev/null; do sleep 0.05; done
+  trap 'rmdir lock' EXIT
   each | while read -r id state _; do
     if [ "$state" = pending ] && [ "$(each | grep -c running)" -lt "$(cat places)" ]; then start "$id"; fi
   done
@@ -105,6 +107,50 @@ impl Batch {
         text.expect("a list is text")
             .lines()
             .map(str::to_owned)
+            .collect()
+    }
+
+    /// Returns the numbers of the allocations that run.
+    pub fn running(&self) -> Vec<String> {
+        let listed = self.list();
+        let running = listed.iter().filter(|line| line.contains(" running "));
+        let id = |line: &String| line.split(' ').next().map(str::to_owned);
+        running.filter_map(id).collect()
+    }
+
+    /// Sends a signal (`KILL`, `TERM`) to all processes of an allocation. After `KILL`, the
+    /// allocation has ended, as after the loss of its node.
+    ///
+    /// # Panics
+    /// If the allocation never started.
+    pub fn signal(&self, id: &str, signal: &str) {
+        let group = self.number(&format!("{id}.group"));
+        // Fails where the group has ended.
+        let _ = Command::new("sh")
+            .args(["-c", &format!("kill -s {signal} -- -{group} 2>/dev/null")])
+            .status();
+        if signal == "KILL" {
+            self.write(&format!("{id}.ended"), "");
+        }
+    }
+
+    /// Returns the allocations that have ended for the batch system but still have processes.
+    ///
+    /// # Panics
+    /// If the folder cannot be listed.
+    pub fn orphans(&self) -> Vec<String> {
+        let lives = |id: &String| {
+            let group = self.number(&format!("{id}.group"));
+            let found = Command::new("sh")
+                .args(["-c", &format!("kill -s 0 -- -{group} 2>/dev/null")])
+                .status();
+            found.expect("there is a shell").success()
+        };
+        let files = fs::read_dir(&self.dir).expect("the test's folder can be listed");
+        let names = files.map(|file| file.expect("it can be read").path());
+        let groups = names.filter(|path| path.extension().is_some_and(|e| e == "group"));
+        let ids = groups.filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()));
+        ids.filter(|id| self.dir.join(format!("{id}.ended")).exists() && lives(id))
             .collect()
     }
 

@@ -9,6 +9,7 @@ mod bad_input;
 mod calibrated;
 mod chaos;
 mod chaos_disks;
+mod chaos_elastic;
 mod clouds;
 mod collect;
 mod corrected;
