@@ -176,11 +176,17 @@ fn apart(one: &(Trained, Vec<f32>), other: &(Trained, Vec<f32>)) -> (f32, f32) {
     let weights = |trained: &Trained| picofarm_model::weights::read(&trained.weights).unwrap().0;
     let (ours, theirs) = (weights(&one.0), weights(&other.0));
     assert!(ours.keys().eq(theirs.keys()), "the same names");
-    let pairs = ours.iter().flat_map(|(name, (shape, values))| {
+    let mut weights = 0.0f32;
+    for (name, (shape, values)) in &ours {
         assert_eq!(*shape, theirs[name].0, "{name}");
-        values.iter().copied().zip(theirs[name].1.iter().copied())
-    });
-    (losses, most(&mut { pairs }))
+        let pairs = values.iter().copied().zip(theirs[name].1.iter().copied());
+        let found = most(&mut { pairs });
+        if found > 1e-4 {
+            eprintln!("{name}: {found:.1e} apart");
+        }
+        weights = weights.max(found);
+    }
+    (losses, weights)
 }
 
 #[test]
