@@ -12,7 +12,7 @@ set -eu
 cd "$1"
 start() {
   date +%s >"$1.started"
-  PICOFARM_ALLOCATION=$1 setsid sh -c 'trap : TERM; bash "$0.sh" >"$0.stderr" 2>&1; : >"$0.ended"' "$1" </dev/null >/dev/null 2>&1 &
+  PICOFARM_ALLOCATION=$1 setsid sh -c 'trap : TERM; bash "$0.sh" >"$0.stderr" 2>&1; : >"$0.ended"' "$1" </dev/null >/dev/null 2>&1 9>&- &
   echo $! >"$1.group"
 }
 each() { # each ID STATE of what has not ended
@@ -33,8 +33,8 @@ submit)
   echo "$id"
   ;;
 list)
-  until mkdir lock 2>/dev/null; do sleep 0.05; done
-  trap 'rmdir lock' EXIT
+  exec 9>lock
+  flock 9
   each | while read -r id state _; do
     if [ "$state" = pending ] && [ "$(each | grep -c running)" -lt "$(cat places)" ]; then start "$id"; fi
   done

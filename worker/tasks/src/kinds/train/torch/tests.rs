@@ -244,11 +244,20 @@ fn a_frozen_encoder_stays_what_it_was() {
         let begun =
             || Training::start(plan.clone(), Some(&tof.weights), sources(&plan), &cpu()).unwrap();
         let theirs = begun().on(Box::new(engine(&python, &plan, 1))).unwrap();
-        let (losses, weights) = apart(&whole(begun()), &whole(theirs));
-        assert!(
-            losses < 1e-4 && weights < 1e-3,
-            "{architecture:?}: {losses} {weights}"
-        );
+        let (ours, theirs) = (whole(begun()), whole(theirs));
+        // Gradients of channels that the encoder leaves dark are rounding errors, which Adam
+        // enlarges: such weights of the decoder differ, and change nothing.
+        let (losses, _) = apart(&ours, &theirs);
+        assert!(losses < 1e-4, "{architecture:?}: {losses}");
+        let read = |trained: &Trained| picofarm_model::weights::read(&trained.weights).unwrap().0;
+        let (before, after) = (read(&tof), read(&theirs.0));
+        let frozen = |name: &&String| name.starts_with("encoders") || name.starts_with("time_");
+        let mut count = 0;
+        for name in after.keys().filter(frozen) {
+            assert_eq!(after[name], before[name], "{name}");
+            count += 1;
+        }
+        assert!(count > 3, "{count}");
     }
 }
 
