@@ -46,9 +46,13 @@ impl Process {
         for (name, _) in std::env::vars_os().filter(|(name, _)| ours(name)) {
             command.env_remove(name);
         }
+        // Files that a killed process leaves, such as those of torchrun, go with the folder.
+        let temporary = folder.join("tmp");
+        std::fs::create_dir_all(&temporary)?;
         let mut child = command
             .arg(folder.join("runner.py"))
             .env("PICOFARM_RUN", folder)
+            .env("TMPDIR", temporary)
             .env("PYTHONUNBUFFERED", "1")
             .env("PYTHONDONTWRITEBYTECODE", "1")
             .env("OMP_NUM_THREADS", rayon::current_num_threads().to_string())
