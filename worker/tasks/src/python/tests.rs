@@ -214,6 +214,15 @@ def main():
 }
 
 #[test]
+fn temporary_files_go_with_the_folder_of_the_task() {
+    let code = "import os, tempfile\ndef main():\n    inside = tempfile.gettempdir().startswith(os.environ['PICOFARM_RUN'])\n    raise ValueError(f'inside {inside}')\n";
+    if let Some((ended, _)) = play(code) {
+        let what = user(ended);
+        assert!(what.contains("inside True"), "{what}");
+    }
+}
+
+#[test]
 fn a_failure_names_the_last_lines_of_the_traceback() {
     let Some((ended, _)) =
         play("def main():\n    print('begun')\n    raise ValueError('bad lr')\n")
