@@ -44,6 +44,24 @@ cancel) if [ ! -e "$3.started" ]; then : >"$3.ended"; fi ;;
 esac
 "#;
 
+/// Options of a pool of at most two workers that end soon.
+pub const POOL: [&str; 14] = [
+    "--max-workers",
+    "2",
+    "--time-limit",
+    "10m",
+    "--cores",
+    "1",
+    "--memory-gib",
+    "2",
+    "--idle",
+    "2s",
+    "--every",
+    "1s",
+    "--log",
+    "info",
+];
+
 /// The batch system, with everything that it runs. It ends on drop.
 pub struct Batch {
     dir: PathBuf,

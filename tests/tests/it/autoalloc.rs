@@ -1,26 +1,8 @@
 //! Workers that come and go with the tasks, on a batch system made of a shell script and on a real
 //! Slurm cluster on this machine.
 
-use picofarm_tests::{Batch, Farm, Job, Process, Slurm, wait::until};
+use picofarm_tests::{Batch, Farm, Job, Process, Slurm, batch::POOL, wait::until};
 use serde_json::Value;
-
-/// Options of a pool of at most two workers that end soon.
-const POOL: [&str; 14] = [
-    "--max-workers",
-    "2",
-    "--time-limit",
-    "10m",
-    "--cores",
-    "1",
-    "--memory-gib",
-    "2",
-    "--idle",
-    "2s",
-    "--every",
-    "1s",
-    "--log",
-    "info",
-];
 
 fn words(args: &[String]) -> Vec<&str> {
     args.iter().map(String::as_str).collect()

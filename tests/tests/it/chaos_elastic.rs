@@ -10,11 +10,12 @@ use std::{
     time::{Duration, Instant},
 };
 
-use picofarm_tests::{Batch, Farm, Job, Process, farm::undisturbed, rng::Rng, store, wait::until};
+use picofarm_tests::{
+    Batch, Farm, Job, Process, batch::POOL, farm::undisturbed, rng::Rng, store, wait::until,
+};
 
 /// Short, so that the tasks of killed workers soon go to others.
 const LEASE_S: f64 = 3.0;
-const WORKERS: &str = "3";
 const ROUNDS: u64 = 6;
 
 fn rounds() -> u64 {
@@ -47,22 +48,7 @@ impl Site {
     }
 
     fn start_pool(&mut self) {
-        let args = self.batch.args(&[
-            "--max-workers",
-            WORKERS,
-            "--time-limit",
-            "10m",
-            "--cores",
-            "1",
-            "--memory-gib",
-            "2",
-            "--idle",
-            "2s",
-            "--every",
-            "1s",
-            "--log",
-            "info",
-        ]);
+        let args = self.batch.args(&POOL);
         let args: Vec<&str> = args.iter().map(String::as_str).collect();
         self.pool = Some(self.farm.cli().start("autoalloc", &args));
     }

@@ -11,6 +11,7 @@ use serde_json::Value;
 use tracing::info;
 
 use crate::{
+    errors::in_field,
     stores::Stores,
     task::{Control, Output, TaskError},
 };
@@ -83,6 +84,7 @@ impl<'a> Course<'a> {
         control: &Control,
     ) -> Result<Option<TrialRecord>, TaskError> {
         let trial = self.trial;
+        self.check_name(control)?;
         let looked = self.models.trial(&trial.sweep, &trial.id, trial.index);
         let found = self.stores.wait(control, looked)?;
         if let Some(found) = &found
@@ -104,6 +106,20 @@ impl<'a> Course<'a> {
             self.forget(ended, control)?;
         }
         Ok(found)
+    }
+
+    /// Refuses a sweep under the name of another training's model before its trials are trained,
+    /// because its best model could not get the name.
+    fn check_name(&self, control: &Control) -> Result<(), TaskError> {
+        let name = &*self.trial.sweep;
+        let held = self.stores.wait(control, self.models.look(name));
+        match held.map_err(|e| in_field("sweep", e))? {
+            Some(model) if model.lineage.promoted.is_none() => Err(TaskError::User(format!(
+                "sweep: {name:?} is the model of another training; choose another name for the model, \
+                 or delete that one by `picofarm model remove`"
+            ))),
+            _ => Ok(()),
+        }
     }
 
     /// Returns whether the trial continues after an epoch.

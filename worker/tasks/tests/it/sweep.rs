@@ -265,6 +265,17 @@ async fn what_cannot_be_compared_is_refused() {
         "{said}"
     );
     let short = json!({"epochs": 1, "batch": 2});
+    // Nothing is trained for a name that the best trial could not get.
+    run(place.training(json!({"model": "m", "optimise": short})))
+        .await
+        .unwrap();
+    let stages = sweep(&place, &json!({"over": {"lr": [1e-2]}}), &json!({}));
+    let said = refused(stages[0].clone()).await;
+    assert!(
+        said.contains("\"m\" is the model of another training"),
+        "{said}"
+    );
+    assert!(place.models().look("m.0").await.unwrap().is_none());
     run(place.training(json!({"model": "bare", "split": "bare", "optimise": short})))
         .await
         .unwrap();
