@@ -11,7 +11,13 @@ use super::{
     number::{digits, short},
     text::Safe,
 };
-use picofarm_model::train::{Line, epochs_at};
+use picofarm_model::{
+    metric::Metrics,
+    train::{Line, epochs_at},
+};
+
+/// The error of own trainings: the loss of their histories, which the job file defines.
+const OBJECTIVE: &str = "objective";
 
 /// A sweep.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -99,6 +105,14 @@ impl End {
 const ENDS: [End; 4] = [End::Finished, End::Pruned, End::Diverged, End::Open];
 
 impl Sweep {
+    /// Returns the error at a line of a trial's history; `None` if nothing was measured there.
+    pub fn error_at(&self, line: &Line) -> Option<f64> {
+        match self.error == OBJECTIVE {
+            true => Some(line.loss),
+            false => line.validation.as_ref().map(Metrics::loss),
+        }
+    }
+
     /// Returns the best of the finished trials.
     pub fn best(&self) -> Option<&Tried> {
         let finished = self.trials.iter().filter(|t| t.end == End::Finished);
@@ -235,7 +249,7 @@ fn curves(sweep: &Sweep) -> String {
         label: format!("{} ({})", trial.model, trial.end.name()),
         style: trial.end.style(),
         points: epochs_at(&trial.history)
-            .filter_map(|(at, line)| Some((at, line.validation.as_ref()?.loss(), 0.0)))
+            .filter_map(|(at, line)| Some((at, sweep.error_at(line)?, 0.0)))
             .collect(),
         joined: true,
         marks: trial.history.len() == 1,
@@ -243,7 +257,10 @@ fn curves(sweep: &Sweep) -> String {
     let lines: Vec<Series> = lines.collect();
     let x = axis("epoch", false);
     let losses = lines.iter().flat_map(|s| &s.points).map(|p| p.1);
-    let label = format!("validation {}", sweep.error);
+    let label = match sweep.error == OBJECTIVE {
+        true => OBJECTIVE.to_owned(),
+        false => format!("validation {}", sweep.error),
+    };
     let y = axis(&label, far_apart(losses));
     let chart = chart("Validation error", &x, &y, &lines);
     drawn(&format!("<div class=\"charts\">{chart}</div>"), sweep)
@@ -317,7 +334,7 @@ fn far_apart(values: impl Iterator<Item = f64>) -> bool {
 pub fn error_name(kind: &str) -> &'static str {
     match kind {
         "tof" => "MAE (m)",
-        "python" => "objective",
+        "python" => OBJECTIVE,
         _ => "1 − IoU",
     }
 }
@@ -325,7 +342,6 @@ pub fn error_name(kind: &str) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use picofarm_model::metric::Metrics;
 
     fn tried(index: u64, lr: f64, end: End, losses: &[f64]) -> Tried {
         let line = |(i, mae_m): (usize, &f64)| Line {
@@ -366,6 +382,19 @@ mod tests {
                 tried(3, 1e-1, End::Diverged, &[]),
             ],
         }
+    }
+
+    #[test]
+    fn the_error_of_own_trainings_is_their_loss_and_of_others_that_of_their_validation() {
+        let mut line = tried(0, 0.1, End::Finished, &[3.0]).history[0];
+        let sweep = |error: &str| Sweep {
+            error: error.into(),
+            ..Sweep::default()
+        };
+        assert_eq!(sweep("MAE (m)").error_at(&line), Some(3.0));
+        (line.loss, line.validation) = (7.0, None);
+        assert_eq!(sweep("MAE (m)").error_at(&line), None);
+        assert_eq!(sweep(error_name("python")).error_at(&line), Some(7.0));
     }
 
     #[test]

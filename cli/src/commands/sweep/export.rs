@@ -74,7 +74,7 @@ fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
                 line.step.to_string(),
                 line.loss.to_string(),
                 line.learning_rate.to_string(),
-                number(line.validation.map(|found| found.loss())),
+                number(sweep.error_at(line)),
             ]
         }));
     }

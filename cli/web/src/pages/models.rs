@@ -2,7 +2,7 @@
 
 mod sweep;
 
-use std::sync::Arc;
+use std::{collections::BTreeSet, sync::Arc};
 
 use futures::future::join_all;
 use maud::{Markup, html};
@@ -209,6 +209,9 @@ fn facts(store: &str, model: &Model) -> Markup {
 
 /// The losses of a history: that of the training steps, and that on the validation scenes.
 fn curve(history: &[Value]) -> Markup {
+    if history.iter().any(is_own) {
+        return own_curves(history);
+    }
     let at = |line: &Value| line["step"].as_f64().unwrap_or(f64::NAN);
     let points = |figure: &dyn Fn(&Value) -> Option<f64>| {
         let lines = history.iter();
@@ -234,12 +237,45 @@ fn curve(history: &[Value]) -> Markup {
     }
 }
 
+/// Whether a line of a history is a report of an own training.
+fn is_own(line: &Value) -> bool {
+    line["metrics"].is_object()
+}
+
+/// The metrics that an own training has reported, each over epochs, or over steps if it counts no
+/// epochs.
+fn own_curves(history: &[Value]) -> Markup {
+    let metrics = history
+        .iter()
+        .filter_map(|line| line["metrics"].as_object())
+        .flat_map(|metrics| metrics.keys());
+    let names: BTreeSet<&String> = metrics.collect();
+    let across = match history.iter().any(|line| line["epoch"].is_number()) {
+        true => "epoch",
+        false => "step",
+    };
+    let series = |name: &str| {
+        let point = |line: &Value| Some((line[across].as_f64()?, line["metrics"][name].as_f64()?));
+        [Series {
+            label: name.to_owned(),
+            class: "validation",
+            points: history.iter().filter_map(point).collect(),
+        }]
+    };
+    html! {
+        @for name in names {
+            h3 { (safe(name)) }
+            (lines(&format!("{name} by {across}"), [across, ""], &series(name)))
+        }
+    }
+}
+
 /// The loss on validation scenes of a line of a history: the mean absolute error in metres, or one
 /// minus IoU.
 fn validation_loss(line: &Value) -> Option<f64> {
     let found = &line["validation"];
-    if found.is_null() && line["metrics"].is_object() {
-        // An own training, whose loss is its objective.
+    if is_own(line) {
+        // Its loss is its objective.
         return line["loss"].as_f64();
     }
     let mae = found["mae_m"].as_f64();
@@ -342,6 +378,19 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+
+    #[test]
+    fn each_metric_of_an_own_training_has_a_curve() {
+        let line = |epoch: u64| json!({"epoch": epoch, "step": null, "metrics": {"mae_m": 1.0 / epoch as f64, "<b>": 2}});
+        let drawn = curve(&[line(1), line(2)]).into_string();
+        assert_eq!(drawn.matches("<polyline").count(), 2, "{drawn}");
+        assert!(
+            drawn.contains("<h3>mae_m</h3>") && !drawn.contains("<b>"),
+            "{drawn}"
+        );
+        let steps = [json!({"epoch": null, "step": 5, "metrics": {"a": 1.0}})];
+        assert!(curve(&steps).into_string().contains("a by step"));
+    }
 
     #[test]
     fn scenes_are_in_the_order_of_their_errors() {
