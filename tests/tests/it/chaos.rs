@@ -23,7 +23,7 @@ const LEASE_S: f64 = 3.0;
 const WORKERS: usize = 6;
 
 /// Number of rounds of the short form.
-const ROUNDS: u64 = 8;
+const ROUNDS: u64 = 5;
 /// Normal size of the store's disk, in MiB.
 const DISK_MIB: u64 = 256;
 

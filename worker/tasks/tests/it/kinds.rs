@@ -447,7 +447,7 @@ fn networks_that_are_stopped_go_on_from_their_checkpoint_to_the_same_bytes() {
         let at = 0.5 + 0.3 * f32::from(strike) / 20.0;
         let striker = std::thread::spawn(move || {
             while hand.fraction() < at {
-                std::thread::yield_now();
+                std::thread::sleep(std::time::Duration::from_millis(1));
             }
             hand.stop();
         });

@@ -105,7 +105,7 @@ fn parts(r: &Rendered) -> Vec<f64> {
 /// Checks that renders with and without light paths agree within a few errors of the means over
 /// seeds, and that these errors are below `small`.
 fn same(name: &str, s: &Scene, (off, on): (u32, u32), max_bounces: Option<u32>, small: f64) {
-    let seeds = 24;
+    let seeds = 12;
     let make = |caustics, passes| {
         move |seed| Settings {
             max_bounces,

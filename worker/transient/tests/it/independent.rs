@@ -2,8 +2,8 @@
 //! tracer in f64.
 //!
 //! The scenes include furnished rooms, and spots close to and in near-mirrors. Pixels with a spot
-//! and pixels that see a near-mirror are compared separately. `PICOFARM_EFFORT=32 cargo test
-//! --release -p picofarm-transient --test independent -- --nocapture` measures with 32 times the
+//! and pixels that see a near-mirror are compared separately. `PICOFARM_EFFORT=64 cargo test
+//! --release -p picofarm-transient --test independent -- --nocapture` measures with 64 times the
 //! paths: the figures of docs/benchmarks.md. `PICOFARM_RUN=1` and so on are runs with other seeds.
 
 use crate::common;
@@ -35,7 +35,7 @@ fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize)
             let mut rng = Noise(1_000 + BATCHES * run() + batch);
             let mut sums = Sums::default();
             for s in sources {
-                let share = effort * 5_000 / sources.len();
+                let share = effort * 2_500 / sources.len();
                 for (part, many) in [(0, (8 * share, 2)), (1, (share, LONGEST))] {
                     tracer.carry(s, many, &mut rng, |seen| {
                         if !is_mirror(seen.bsdf) && usize::from(seen.more) == part {
@@ -44,13 +44,13 @@ fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize)
                     });
                 }
             }
-            tracer.glints(sources, effort * 5_000, &mut rng, |pixel, value| {
+            tracer.glints(sources, effort * 2_500, &mut rng, |pixel, value| {
                 sums[regions[pixel]][0] += value;
             });
             tracer.through_mirrors(
                 sources,
                 &likely,
-                effort * 5_000,
+                effort * 2_500,
                 &mut rng,
                 |pixel, value| {
                     sums[regions[pixel]][1] += value;

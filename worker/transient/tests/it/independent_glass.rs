@@ -1,7 +1,7 @@
 //! Like `independent.rs`, with glass that reflects and refracts: a window and a partition, a ball
 //! and a cube of glass, a vessel. `glass_tracer.rs` tests the independent tracer itself.
-//! `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test independent_glass --
-//! --nocapture` measures with 32 times the paths.
+//! `PICOFARM_EFFORT=64 cargo test --release -p picofarm-transient --test independent_glass --
+//! --nocapture` measures with 64 times the paths.
 
 use crate::common;
 
@@ -84,15 +84,15 @@ fn bent(
 
 /// Returns the tracer's energies, summed over all classes.
 fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize) -> Energies {
-    let lights = 1_500 * (effort as f64).sqrt() as usize;
+    let lights = 1_000 * (effort as f64).sqrt() as usize;
     let batches: Vec<Classes> = (0..BATCHES)
         .into_par_iter()
         .map(|batch| {
             let mut rng = Noise(1_000 + batch);
             let mut all = Classes::default();
-            let paths = (24_000 * effort, &mut rng);
+            let paths = (12_000 * effort, &mut rng);
             straight(tracer, sources, regions, paths, &mut all);
-            let paths = (6_000 * effort, lights, &mut rng);
+            let paths = (3_000 * effort, lights, &mut rng);
             let connects = (sources, Connects::NearestToSpot);
             bent(tracer, connects, regions, paths, &mut all);
             all

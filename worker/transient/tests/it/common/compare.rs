@@ -82,7 +82,7 @@ pub fn rendered(scene: &Scene, regions: &[usize], effort: usize) -> Energies {
                     bin_width_m: 1.0,
                     bins: 400,
                 },
-                ..settings(Budget::Samples(6 * effort as u32))
+                ..settings(Budget::Samples(3 * effort as u32))
             };
             let r = ok(scene, &set);
             let split = r.split.expect("a split was asked for");
