@@ -34,6 +34,9 @@ pub use paper::{Published, published, unlike};
 pub use picture::{Picture, Plane, pictures};
 pub use summary::{Group, Order, Scaling, Spread, Summary, json, summary};
 
+/// The version of pages and JSON. It is part of the key of a report.
+pub const VERSION: &str = "report-2";
+
 /// The contents of a report.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -124,7 +124,9 @@ pub(super) fn verdict(group: &Group) -> Option<String> {
         false => ("warn", "no better than a trivial answer"),
     };
     let (label, name) = (Safe(&group.label), Safe(name));
-    let ratio = digits(*ratio, 2);
+    // A difference that two places hide is shown with four.
+    let places = if (0.995..1.0).contains(ratio) { 4 } else { 2 };
+    let ratio = digits(*ratio, places);
     Some(format!(
         "<p class=\"{class}\">{label}: {better}: {ratio} times the error of \u{201c}{name}\u{201d}.</p>"
     ))

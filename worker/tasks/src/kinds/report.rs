@@ -63,7 +63,7 @@ impl Collector {
 
 impl RunTask for ReportTask {
     fn code_version() -> String {
-        model_version()
+        format!("{}/{}", model_version(), picofarm_report::VERSION)
     }
 
     /// Makes and stores the report that `task` names; with `force`, even if it exists.
@@ -263,6 +263,36 @@ fn known(n: u32) -> Option<u32> {
     (n > 0).then_some(n)
 }
 
+/// Returns the settings beyond the plan in which models differ.
+fn conditions(manifest: &ModelManifest, evaluation: Option<&Evaluation>) -> Vec<(String, String)> {
+    let mut out = Vec::new();
+    let mut differs = |name: &str, value: &str| out.push((name.to_owned(), value.to_owned()));
+    if let Some(histogram) = setting(manifest, "/histogram") {
+        differs("histogram", histogram);
+    }
+    let times = evaluation
+        .map(|e| &*e.times)
+        .filter(|times| !times.is_empty());
+    if let Some(times) = times.or_else(|| setting(manifest, "/shadow/times")) {
+        let from = match times {
+            TRUTH => "the truth",
+            _ => "a depth network",
+        };
+        differs("two-bounce times from", from);
+    }
+    if setting(manifest, "/from").is_some() {
+        differs("begins", "trained");
+    }
+    if let Some(runtime) = manifest.lineage.runtime.get("program") {
+        differs("runtime", runtime);
+    }
+    out
+}
+
+fn setting<'a>(manifest: &'a ModelManifest, path: &str) -> Option<&'a str> {
+    manifest.settings.pointer(path).and_then(Value::as_str)
+}
+
 /// Fills in the model's origin.
 fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Evaluation>) {
     let from = &manifest.lineage;
@@ -277,25 +307,7 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
         spots: known(from.measurement.spots),
         noise: from.measurement.photon_noise,
     };
-    let setting = |path: &str| manifest.settings.pointer(path).and_then(|v| v.as_str());
-    if let Some(histogram) = setting("/histogram") {
-        let histogram = histogram.to_owned();
-        entry.conditions.push(("histogram".into(), histogram));
-    }
-    let times = evaluation
-        .map(|e| &*e.times)
-        .filter(|times| !times.is_empty());
-    if let Some(times) = times.or_else(|| setting("/shadow/times")) {
-        let from = match times {
-            TRUTH => "the truth",
-            _ => "a depth network",
-        };
-        let from = ("two-bounce times from".into(), from.into());
-        entry.conditions.push(from);
-    }
-    if setting("/from").is_some() {
-        entry.conditions.push(("begins".into(), "trained".into()));
-    }
+    entry.conditions = conditions(manifest, evaluation);
     let line = |name: &str, value: String| (name.to_owned(), value);
     entry.lineage = vec![
         line("data", format!("{} ({})", from.dataset, from.data)),
@@ -308,13 +320,21 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
         line("manifest SHA-256", manifest.sha256()),
     ];
     if let Some(augment) = manifest.settings["augment"].as_bool() {
-        let numbered = matches!(setting("/shadow/variant"), Some("index" | "all"));
+        let numbered = matches!(setting(manifest, "/shadow/variant"), Some("index" | "all"));
         let how = match (augment, numbered) {
             (false, _) => "not shown",
             (true, false) => "shown",
             (true, true) => "not shown: spots are known by their number",
         };
         entry.lineage.push(line("mirrored scenes", how.into()));
+    }
+    if !from.runtime.is_empty() {
+        let parts = from
+            .runtime
+            .iter()
+            .map(|(name, value)| format!("{name} {value}"));
+        let runtime = parts.collect::<Vec<_>>().join(", ");
+        entry.lineage.push(line("runtime", runtime));
     }
     for (name, sha256) in &from.models {
         entry
@@ -324,5 +344,25 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
     if let Some(e) = evaluation {
         let on = format!("{} {} scenes of {}", e.scenes, e.side, e.dataset);
         entry.lineage.push(line("evaluated on", on));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn trainings_by_another_runtime_are_an_experiment_of_their_own() {
+        let embedded = ModelManifest {
+            settings: serde_json::json!({"histogram": "transient"}),
+            ..ModelManifest::default()
+        };
+        let mut torch = embedded.clone();
+        torch.lineage.runtime = [("program".to_owned(), "torch".to_owned())].into();
+        let line = |name: &str, value: &str| (name.to_owned(), value.to_owned());
+        let common = line("histogram", "transient");
+        assert_eq!(conditions(&embedded, None), std::slice::from_ref(&common));
+        let apart = [common, line("runtime", "torch")];
+        assert_eq!(conditions(&torch, None), apart);
     }
 }
