@@ -82,6 +82,8 @@ pub struct Listing {
     pub sets: Vec<DataSet>,
     /// Results about their scenes.
     pub made: Vec<Made>,
+    /// Folders with models, which may have no data set.
+    pub models: Vec<String>,
     /// What cannot be read.
     pub unread: Vec<Unread>,
 }
@@ -135,13 +137,15 @@ impl Stores {
         self.places.iter().map(|place| &*place.name)
     }
 
-    /// Returns the folders that may have models: the named stores, and those with data sets.
+    /// Returns the folders that may have models: the named stores, and those with data sets or
+    /// models.
     pub async fn folders(&self) -> BTreeSet<String> {
         let listed = self.list().await;
         let parents = listed.sets.iter().filter_map(|set| set.id.rsplit_once('/'));
         let parents = parents.map(|(parent, _)| parent.to_owned());
         let named = (0..self.places.len()).map(|position| position.to_string());
-        parents.chain(named).collect()
+        let found = listed.models.iter().cloned();
+        parents.chain(named).chain(found).collect()
     }
 
     /// Returns the data sets, and what cannot be read.
@@ -350,7 +354,12 @@ impl Place {
                     kind,
                 }),
                 // The last is looked at first.
-                Ok(Found::Folders(inner)) => folders.extend(inner.into_iter().rev()),
+                Ok(Found::Folders(inner)) => {
+                    if inner.iter().any(|(_, name, _)| name.ends_with("/models")) {
+                        found.models.push(format!("{position}{below}"));
+                    }
+                    folders.extend(inner.into_iter().rev());
+                }
                 Err(error) => found.unread.push(unread(&below, error.into())),
             }
         }
@@ -437,5 +446,15 @@ mod tests {
         ] {
             assert!(stores.folder(id).is_err(), "{id}");
         }
+    }
+
+    #[tokio::test]
+    async fn a_store_without_data_sets_may_have_models() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(folder.path().join("mine/models/net")).unwrap();
+        std::fs::write(folder.path().join("mine/models/net/manifest.json"), "{}").unwrap();
+        let stores = Stores::open(&[folder.path().display().to_string()]).unwrap();
+        let found = stores.folders().await;
+        assert_eq!(found, ["0", "0/mine"].map(str::to_owned).into());
     }
 }
