@@ -190,6 +190,17 @@ parameters = {{ epochs = 12, lr = "{{lr}}", wait = 0 }}
     let promoted = &named["manifest"]["lineage"]["promoted"];
     assert_eq!(promoted["model"], best["model"], "{named}");
     assert!(promoted["values"]["lr"].as_f64().unwrap() > 0.1, "{named}");
+
+    let table = farm.scratch.join("curves.csv");
+    let out = table.to_str().unwrap();
+    farm.run(&["sweep", "export", place, "line", "--curves", "--out", out])
+        .ok();
+    let text = std::fs::read_to_string(&table).unwrap();
+    // The code reports neither a learning rate nor a loss of its own.
+    assert!(
+        text.starts_with("trial,epoch,step,objective\r\n0,1,"),
+        "{text}"
+    );
 }
 
 #[test]

@@ -105,9 +105,14 @@ impl End {
 const ENDS: [End; 4] = [End::Finished, End::Pruned, End::Diverged, End::Open];
 
 impl Sweep {
+    /// Returns whether its trials run the user's own code, which reports only its objective.
+    pub fn own(&self) -> bool {
+        self.error == OBJECTIVE
+    }
+
     /// Returns the error at a line of a trial's history; `None` if nothing was measured there.
     pub fn error_at(&self, line: &Line) -> Option<f64> {
-        match self.error == OBJECTIVE {
+        match self.own() {
             true => Some(line.loss),
             false => line.validation.as_ref().map(Metrics::loss),
         }
@@ -257,7 +262,7 @@ fn curves(sweep: &Sweep) -> String {
     let lines: Vec<Series> = lines.collect();
     let x = axis("epoch", false);
     let losses = lines.iter().flat_map(|s| &s.points).map(|p| p.1);
-    let label = match sweep.error == OBJECTIVE {
+    let label = match sweep.own() {
         true => OBJECTIVE.to_owned(),
         false => format!("validation {}", sweep.error),
     };

@@ -57,25 +57,24 @@ fn trials(sweep: &Sweep) -> Vec<Vec<String>> {
 /// Returns a row for each line in the history of each trial that has ended: its epochs, and
 /// validations within them.
 fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
-    let header = [
-        "trial",
-        "epoch",
-        "step",
-        "loss",
-        "learning_rate",
-        &sweep.error,
-    ];
-    let mut rows = vec![header.map(str::to_owned).to_vec()];
+    let mut header = vec!["trial", "epoch", "step"];
+    if !sweep.own() {
+        header.extend(["loss", "learning_rate"]);
+    }
+    header.push(&sweep.error);
+    let mut rows = vec![header.into_iter().map(str::to_owned).collect()];
     for trial in &sweep.trials {
         rows.extend(trial.history.iter().map(|line| {
-            vec![
+            let mut row = vec![
                 trial.index.to_string(),
                 line.epoch.to_string(),
                 line.step.to_string(),
-                line.loss.to_string(),
-                line.learning_rate.to_string(),
-                number(sweep.error_at(line)),
-            ]
+            ];
+            if !sweep.own() {
+                row.extend([line.loss.to_string(), line.learning_rate.to_string()]);
+            }
+            row.push(number(sweep.error_at(line)));
+            row
         }));
     }
     rows
