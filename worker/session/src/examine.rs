@@ -100,3 +100,69 @@ fn checks(executor: &dyn Executor, allowed: &StorePrefixes, mut what: Examine) -
     checks.extend(refused);
     checks
 }
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        collections::BTreeMap,
+        sync::{Mutex, mpsc::Receiver},
+    };
+
+    use super::*;
+    use crate::{Control, Output, Task, TaskError};
+
+    /// Repeats the question. It waits until the test lets it go on.
+    struct Waits(Mutex<Receiver<()>>);
+
+    impl Executor for Waits {
+        fn kinds(&self) -> BTreeMap<String, String> {
+            BTreeMap::new()
+        }
+
+        fn assets(&self) -> Vec<String> {
+            Vec::new()
+        }
+
+        fn examine(&self, what: &Examine) -> Vec<Check> {
+            self.0.lock().unwrap().recv().unwrap();
+            let detail = format!("{:?} {:?}", what.store, what.scenes);
+            vec![Check::new("places", Verdict::Ok, detail)]
+        }
+
+        fn run(&self, _: &Task, _: &Control) -> Result<Output, TaskError> {
+            Err(TaskError::Stopped)
+        }
+    }
+
+    fn question(id: u64, store: &str) -> Examine {
+        Examine {
+            id,
+            store: store.into(),
+            scenes: "/data/scenes".into(),
+        }
+    }
+
+    #[tokio::test]
+    async fn an_examination_opens_only_allowed_places_and_a_second_one_is_answered_at_once() {
+        let (go, wait) = std::sync::mpsc::channel();
+        let allowed = StorePrefixes::new(&["/data".into()]).unwrap();
+        let mut examiner = Examiner::new(Arc::new(Waits(Mutex::new(wait))), allowed);
+        examiner.begin(question(1, "/etc"));
+        examiner.begin(question(2, "/data"));
+        let busy = examiner.finished().await;
+        assert_eq!((busy.id, busy.checks[0].verdict), (2, Verdict::Bad));
+        go.send(()).unwrap();
+        let first = examiner.finished().await;
+        assert!(first.id == 1 && first.clock_ms > 0);
+        assert_eq!(first.checks[0].detail, "\"\" \"/data/scenes\"");
+        assert_eq!(
+            (&*first.checks[1].what, first.checks[1].verdict),
+            ("store", Verdict::Bad)
+        );
+        examiner.begin(question(3, "/data/store"));
+        go.send(()).unwrap();
+        let third = examiner.finished().await;
+        assert_eq!((third.id, third.checks.len()), (3, 1));
+        assert_eq!(third.checks[0].detail, "\"/data/store\" \"/data/scenes\"");
+    }
+}

@@ -161,7 +161,7 @@ async fn a_user_gets_no_lease_and_no_job_beyond_the_quota_of_bytes() {
         assert!(farm.submit(&spec(9)).await.existed);
         // The sum outlives the process, and a higher bound lets the job end.
         farm.restart().await;
-        let mut worker = farm.worker().await;
+        let worker = farm.worker().await;
         worker.credit(1).await;
         let why = reasons(&mut farm, &job).await;
         assert_eq!(why[0].code, "quota_bytes", "{why:?}");
