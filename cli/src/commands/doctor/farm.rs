@@ -61,7 +61,7 @@ pub async fn run(args: &Doctor, settings: &Settings, output: Output) -> Result<(
         ));
     }
     if ask.store.is_empty() {
-        output.warn("no store was checked; name it with --store".to_owned());
+        output.warn("no store was checked; name it with --store");
     }
     finish(&rows)
 }
