@@ -1,5 +1,5 @@
-//! Text for display: safe terminal output of foreign text, shell arguments, and suggestions for
-//! misspelt names.
+//! Text for display: safe terminal output of foreign text, shell arguments, sizes, and suggestions
+//! for misspelt names.
 
 use std::{borrow::Cow, cmp::Reverse, fmt::Write};
 
@@ -151,6 +151,19 @@ fn named(message: &str) -> String {
         Some(name) => format!("{}; did you mean `{name}`?", message.trim_end()),
         None => message.to_owned(),
     }
+}
+
+/// Formats a size with powers of ten: "512 B", "20.1 MB", "1.90 TB".
+pub fn size(bytes: u64) -> String {
+    let mut value = bytes as f64;
+    for unit in ["B", "kB", "MB", "GB"] {
+        if value < 1000.0 {
+            let digits = usize::from(unit != "B");
+            return format!("{value:.digits$} {unit}");
+        }
+        value /= 1000.0;
+    }
+    format!("{value:.2} TB")
 }
 
 #[cfg(test)]

@@ -50,6 +50,11 @@ pub struct Guard {
     /// workers [default: any number]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub max_cores_per_user: Option<u32>,
+    /// Maximum number of bytes that the jobs of one caller publish, e.g. 2TB; `max_bytes` of a
+    /// caller in the token file goes before it. Deleted results count too (see `picofarm usage`)
+    /// [default: any number]
+    #[arg(long, value_name = "SIZE", value_parser = super::ranges::bytes)]
+    pub max_bytes_per_user: Option<u64>,
     /// Maximum priority, above or below 0, without the role of an administrator
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub max_priority: u32,
@@ -109,6 +114,10 @@ pub enum Token {
         /// --max-cores-per-user [default: that one]
         #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
         max_cores: Option<u32>,
+        /// Maximum number of bytes that its jobs publish, e.g. 2TB, instead of the coordinator's
+        /// --max-bytes-per-user [default: that one]
+        #[arg(long, value_name = "SIZE", value_parser = super::ranges::bytes)]
+        max_bytes: Option<u64>,
         #[command(flatten)]
         file: TokenFile,
     },

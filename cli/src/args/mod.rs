@@ -299,7 +299,17 @@ pub struct Certificates {
 
 #[derive(Args)]
 pub struct Doctor {
-    /// Store to check; it is not created
-    #[arg(long, default_value = ".", value_name = "PATH_OR_URL", value_parser = crate::args::location::parse)]
-    pub store: String,
+    /// Store to check; it is not created [default: this folder; with --farm, none]
+    #[arg(long, value_name = "PATH_OR_URL", value_parser = crate::args::location::parse)]
+    pub store: Option<String>,
+    /// Ask every worker of the coordinator to check its own machine: store, scenes, clock, memory,
+    /// disk, furniture, graphics processors and Python
+    #[arg(long)]
+    pub farm: bool,
+    /// Scene file, or folder with scenes, that workers must be able to read
+    #[arg(long, value_name = "PATH", requires = "farm")]
+    pub scenes: Option<String>,
+    /// Time to wait for the answers of workers, seconds (at most 60)
+    #[arg(long, value_name = "S", requires = "farm", default_value_t = 30.0, value_parser = ranges::patience)]
+    pub within_s: f64,
 }

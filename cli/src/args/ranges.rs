@@ -53,6 +53,28 @@ pub fn gib(text: &str) -> Result<f64, String> {
     within(text, 0.05..=1e6, "GiB (of 1.07 GB)")
 }
 
+/// Parses a number of bytes: 500GB, 2 TB, or 1000000.
+pub fn bytes(text: &str) -> Result<u64, String> {
+    const UNITS: [(&str, f64); 5] = [
+        ("TB", 1e12),
+        ("GB", 1e9),
+        ("MB", 1e6),
+        ("kB", 1e3),
+        ("B", 1.0),
+    ];
+    let text = text.trim();
+    let named = UNITS.iter().find_map(|(unit, of)| {
+        let number = text.strip_suffix(unit)?;
+        Some((number.trim_end(), *of))
+    });
+    let (number, unit) = named.unwrap_or((text, 1.0));
+    let value = number.parse::<f64>().unwrap_or(f64::NAN) * unit;
+    match (1.0..=9e15).contains(&value) {
+        true => Ok(value as u64),
+        false => Err("expected 1 B to 9000 TB, such as 500GB or 2TB".into()),
+    }
+}
+
 /// Parses the size of an image: 256 is a square, or 320x240.
 pub fn image(text: &str) -> Result<Resolution, String> {
     let size: Resolution = text.parse()?;
@@ -83,6 +105,11 @@ pub fn ambient(text: &str) -> Result<f64, String> {
 /// Parses a waiting time.
 pub fn seconds(text: &str) -> Result<f64, String> {
     within(text, 0.0..=1e9, "seconds")
+}
+
+/// Parses the time to wait for answers of workers.
+pub fn patience(text: &str) -> Result<f64, String> {
+    within(text, 1.0..=60.0, "seconds")
 }
 
 /// Parses the duration of a lease. A lease shorter than a heartbeat's round trip would always

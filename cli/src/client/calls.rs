@@ -6,8 +6,8 @@ use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
     messages::{
-        AuditEntry, ConnectedWorker, Event, JobPlan, JobState, JobStatus, JobSummary, Reason,
-        TaskExplanation, UsageBy, UsageRow,
+        AuditEntry, ConnectedWorker, Event, ExaminedWorker, JobPlan, JobState, JobStatus,
+        JobSummary, Reason, TaskExplanation, UsageBy, UsageRow,
     },
     spec::JobSpec,
     wire,
@@ -283,6 +283,19 @@ impl Client {
         Ok(rows.into_iter().map(Into::into).collect())
     }
 
+    /// Asks the workers of a coordinator to check their machines. Returns them, and the number of
+    /// workers connected to other coordinators.
+    pub async fn examine(&mut self, what: &Examination) -> Result<(Vec<ExaminedWorker>, u32)> {
+        let request = wire::ExamineWorkersRequest {
+            store: what.store.clone(),
+            scenes: what.scenes.clone(),
+            within_ms: u32::try_from(what.within.as_millis()).unwrap_or(u32::MAX),
+        };
+        let reply = call!(self, what.within + ANSWER, examine_workers, request);
+        let workers = reply.workers.into_iter().map(Into::into);
+        Ok((workers.collect(), reply.elsewhere))
+    }
+
     /// Returns the workers connected to the coordinator that answers.
     pub async fn workers(&mut self) -> Result<Workers> {
         let reply = call!(self, ANSWER, list_workers, wire::ListWorkersRequest {});
@@ -293,6 +306,16 @@ impl Client {
             coordinators: reply.coordinators,
         })
     }
+}
+
+/// What workers are asked to check.
+pub struct Examination {
+    /// Store; may be empty.
+    pub store: String,
+    /// Scene file or folder; may be empty.
+    pub scenes: String,
+    /// Time to wait for answers.
+    pub within: Duration,
 }
 
 /// Selects jobs of the list.

@@ -22,7 +22,7 @@ use self::connection::{
     CONNECT, NoAnswer, answer, connect_to, first_that_answers, list, none_answers,
 };
 pub use self::{
-    calls::{Explained, Listing, Page, Submitted, Watch, Workers},
+    calls::{Examination, Explained, Listing, Page, Submitted, Watch, Workers},
     connection::{Standing, standing},
     demand::{Demand, PoolWorker, StageDemand},
 };

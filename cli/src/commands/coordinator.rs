@@ -52,6 +52,7 @@ impl Guarded {
             quotas: Quotas {
                 jobs_per_user: args.max_jobs_per_user,
                 cores_per_user: args.max_cores_per_user,
+                bytes_per_user: args.max_bytes_per_user,
                 tasks_per_job: args.max_tasks_per_job,
                 sessions: args.max_sessions,
                 max_priority: args.max_priority,

@@ -1,39 +1,30 @@
 //! `picofarm doctor`: checks whether this machine can render and store.
 
-use picofarm_store::{PROBE_WITHIN, Writable, check_writable};
-use serde::Serialize;
+mod farm;
+
+use picofarm_proto::messages::{Check, Verdict};
+use picofarm_store::PROBE_WITHIN;
+use picofarm_tasks::examine::{disk, memory, store};
 
 use crate::{
     args::Doctor,
     client::Client,
     commands::assets,
     error::{CliError, Code, Result},
-    output::{Output, bytes, table},
+    output::{Output, table},
     settings::Settings,
 };
 
-#[derive(Serialize)]
-#[serde(rename_all = "snake_case")]
-enum Verdict {
-    Ok,
-    /// Picofarm works without it.
-    Note,
-    Bad,
-}
-
-#[derive(Serialize)]
-struct Check {
-    what: &'static str,
-    verdict: Verdict,
-    detail: String,
-}
-
 pub async fn run(args: Doctor, settings: &Settings, output: Output) -> Result<()> {
+    if args.farm {
+        return farm::run(&args, settings, output).await;
+    }
+    let place = args.store.as_deref().unwrap_or(".");
     let checks = [
         processor(),
         memory(),
-        store(&args.store).await,
-        disk(&args.store),
+        store(place, PROBE_WITHIN).await,
+        disk(Some(place)),
         furniture(settings),
         gpus(),
         coordinator(settings).await,
@@ -41,14 +32,7 @@ pub async fn run(args: Doctor, settings: &Settings, output: Output) -> Result<()
     output.result(&checks, || {
         let rows: Vec<_> = checks
             .iter()
-            .map(|c| {
-                let verdict = match c.verdict {
-                    Verdict::Ok => "ok",
-                    Verdict::Note => "note",
-                    Verdict::Bad => "BAD",
-                };
-                vec![verdict.to_owned(), c.what.to_owned(), c.detail.clone()]
-            })
+            .map(|c| vec![c.verdict.word().into(), c.what.clone(), c.detail.clone()])
             .collect();
         table(&rows)
     });
@@ -63,25 +47,9 @@ pub async fn run(args: Doctor, settings: &Settings, output: Output) -> Result<()
 
 fn processor() -> Check {
     Check {
-        what: "processor",
+        what: "processor".into(),
         verdict: Verdict::Ok,
         detail: format!("{} cores, {}", picofarm_tasks::cores(), vector_kernel()),
-    }
-}
-
-/// Reports the memory that tasks may use, and the source of this limit.
-fn memory() -> Check {
-    let found = picofarm_tasks::Memory::here();
-    Check {
-        what: "memory",
-        verdict: match found {
-            Some(_) => Verdict::Ok,
-            None => Verdict::Note,
-        },
-        detail: found.map_or_else(
-            || "not known here; give workers --memory-gib".into(),
-            |found| found.to_string(),
-        ),
     }
 }
 
@@ -130,7 +98,7 @@ fn gpus() -> Check {
         }
     };
     Check {
-        what: "graphics processors",
+        what: "graphics processors".into(),
         verdict,
         detail,
     }
@@ -139,79 +107,21 @@ fn gpus() -> Check {
 #[cfg(not(feature = "networks"))]
 fn gpus() -> Check {
     Check {
-        what: "graphics processors",
+        what: "graphics processors".into(),
         verdict: Verdict::Note,
         detail: "none: built without networks, which alone are computed there".into(),
-    }
-}
-
-/// Checks a store: exactly one writer must win when several create the same object.
-async fn store(place: &str) -> Check {
-    let (verdict, detail) = match check_writable(place, PROBE_WITHIN).await {
-        Ok(Writable::There) => (
-            Verdict::Ok,
-            format!("{place} is writable and creates each object exactly once"),
-        ),
-        Ok(Writable::New(ground)) => (
-            Verdict::Note,
-            format!(
-                "{place} does not exist; is it spelled right? The first task would make it in {}, which is writable",
-                ground.display()
-            ),
-        ),
-        Err(e) => (Verdict::Bad, e.to_string()),
-    };
-    Check {
-        what: "store",
-        verdict,
-        detail,
-    }
-}
-
-/// Free disk space below which results will soon not fit, in bytes.
-const LITTLE: u64 = 10 << 30;
-/// Free disk space below which almost nothing fits, in bytes.
-const NONE: u64 = 256 << 20;
-
-/// Reports the free space for results and temporary files.
-fn disk(place: &str) -> Check {
-    let ground = picofarm_store::local_ground(place).ok().flatten();
-    let places = ground.into_iter().chain([std::env::temp_dir()]);
-    let (mut least, mut details) = (u64::MAX, Vec::new());
-    for folder in places {
-        match rustix::fs::statvfs(&folder) {
-            Ok(about) => {
-                let free = about.f_bavail.saturating_mul(about.f_frsize);
-                least = least.min(free);
-                details.push(format!("{} free in {}", bytes(free), folder.display()));
-            }
-            Err(e) => {
-                least = 0;
-                details.push(format!("{}: {e}", folder.display()));
-            }
-        }
-    }
-    let (verdict, advice) = match least {
-        0..NONE => (Verdict::Bad, "; free some space"),
-        NONE..LITTLE => (Verdict::Note, "; little for a data set"),
-        _ => (Verdict::Ok, ""),
-    };
-    Check {
-        what: "disk",
-        verdict,
-        detail: format!("{}{advice}", details.join(", ")),
     }
 }
 
 fn furniture(settings: &Settings) -> Check {
     match assets::resolve("sweethome3d", &settings.assets) {
         Ok(fingerprint) => Check {
-            what: "furniture",
+            what: "furniture".into(),
             verdict: Verdict::Ok,
             detail: fingerprint,
         },
         Err(_) => Check {
-            what: "furniture",
+            what: "furniture".into(),
             verdict: Verdict::Note,
             detail: "parametric only; `picofarm assets install` fetches real models".into(),
         },
@@ -233,7 +143,7 @@ async fn coordinator(settings: &Settings) -> Check {
         Err(e) => (Verdict::Note, e.message),
     };
     Check {
-        what: "coordinator",
+        what: "coordinator".into(),
         verdict,
         detail,
     }

@@ -6,6 +6,7 @@ mod explain;
 mod finish;
 mod list;
 mod retry;
+mod status;
 mod submit;
 pub(crate) mod template;
 mod verdicts;
@@ -140,9 +141,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         Job::Status { job } => {
             let job = client.find(&job).await?;
-            let status = client.status(job).await?;
-            output.result(&status, || describe(&status));
-            Ok(())
+            status::run(&mut client, job, output).await
         }
         Job::Watch { job } => {
             let job = client.find(&job).await?;

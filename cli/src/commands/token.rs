@@ -16,7 +16,7 @@ use crate::{
     args::Token,
     client::{Standing, standing},
     error::{CliError, Code, Result},
-    output::{Output, printed, table},
+    output::{Output, bytes, printed, table},
     settings::Resolved,
 };
 
@@ -39,10 +39,11 @@ pub async fn run(command: Token, resolved: &Resolved, output: Output) -> Result<
             maintainer,
             expires,
             max_cores,
+            max_bytes,
             file,
         } => {
             let projects = (member, maintainer);
-            let limits = (expires, max_cores);
+            let limits = (expires, max_cores, max_bytes);
             create(&name, role.into(), projects, limits, &file.tokens, output)
         }
         Token::List { file } => {
@@ -57,14 +58,14 @@ fn create(
     name: &str,
     roles: Roles,
     (member, maintainer): (Vec<String>, Vec<String>),
-    (expires, max_cores): (Option<Expiry>, Option<u32>),
+    (expires, max_cores, max_bytes): (Option<Expiry>, Option<u32>, Option<u64>),
     path: &Path,
     output: Output,
 ) -> Result<()> {
     let said = roles.to_string();
     let token = Tokens::edit_or_create(path, |tokens| {
         let token = tokens.create_until(name, roles, member, maintainer, expires)?;
-        tokens.bound_cores(name, max_cores)?;
+        tokens.bound(name, max_cores, max_bytes)?;
         Ok(token)
     })
     .map_err(unusable)?;
@@ -75,7 +76,7 @@ fn create(
     ));
     output.result(
         &json!({"name": name, "roles": said.split(',').collect::<Vec<_>>(), "expires": expires,
-            "max_cores": max_cores, "token": token.expose()}),
+            "max_cores": max_cores, "max_bytes": max_bytes, "token": token.expose()}),
         || token.expose().to_owned(),
     );
     if let Err(unprinted) = printed() {
@@ -107,7 +108,7 @@ fn list(path: &Path, output: Output) -> Result<()> {
         .map(|e| {
             json!({"name": e.name, "roles": e.roles, "certificate": e.certificate,
                 "expires": e.expires, "expired": e.expires.is_some_and(|t| t.is_over(now)),
-                "member": e.member, "maintainer": e.maintainer, "max_cores": e.max_cores})
+                "member": e.member, "maintainer": e.maintainer, "max_cores": e.max_cores, "max_bytes": e.max_bytes})
         })
         .collect();
     output.result(&callers, || {
@@ -123,8 +124,7 @@ fn list(path: &Path, output: Output) -> Result<()> {
                     e.roles.to_string(),
                     proof(&e.certificate),
                     until(e.expires),
-                    e.max_cores
-                        .map_or_else(String::new, |n| format!("at most {n} cores")),
+                    bounds(e),
                     projects.join(", "),
                 ]
             })
@@ -132,6 +132,17 @@ fn list(path: &Path, output: Output) -> Result<()> {
         table(&rows)
     });
     Ok(())
+}
+
+/// Describes the bounds of a caller.
+fn bounds(entry: &Entry) -> String {
+    let cores = entry.max_cores.map(|n| format!("{n} cores"));
+    let stored = entry.max_bytes.map(bytes);
+    let both: Vec<String> = cores.into_iter().chain(stored).collect();
+    match both.is_empty() {
+        true => String::new(),
+        false => format!("at most {}", both.join(", ")),
+    }
 }
 
 async fn revoke(name: &str, path: &Path, resolved: &Resolved, output: Output) -> Result<()> {

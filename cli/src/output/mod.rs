@@ -261,18 +261,7 @@ pub fn program() -> String {
 
 /// Formats a size with powers of ten: "512 B", "20.1 MB", "1.9 TB".
 pub fn bytes(n: u64) -> String {
-    let mut value = n as f64;
-    for unit in ["B", "kB", "MB", "GB"] {
-        if value < 1000.0 {
-            return if unit == "B" {
-                format!("{n} B")
-            } else {
-                format!("{value:.1} {unit}")
-            };
-        }
-        value /= 1000.0;
-    }
-    format!("{value:.2} TB")
+    show::size(n)
 }
 
 #[cfg(test)]

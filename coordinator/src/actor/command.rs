@@ -1,19 +1,19 @@
 //! Requests to the actor, and its answers.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 use picofarm_catalog::CatalogError;
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
-    messages::{Failure, Finished, JobPlan, TaskLog, TaskProgress, WorkerHello},
+    messages::{Examine, Failure, Finished, JobPlan, TaskLog, TaskProgress, WorkerHello},
     spec::{JobSpec, SpecError},
 };
 use tokio::sync::{mpsc, oneshot};
 
 use super::sessions::HeartbeatQueue;
 use crate::core::{
-    Demand, EligibleWorkers, FarmSnapshot, JobSnapshot, NewJob, Overlay, Reported, SessionId,
-    Shape, ToWorker,
+    Asked, Demand, EligibleWorkers, FarmSnapshot, JobSnapshot, NewJob, Overlay, Reported,
+    SessionId, Shape, ToWorker,
 };
 
 /// Sends the answer to a request, or the reason for its refusal.
@@ -81,12 +81,16 @@ pub(crate) enum Command {
         reply: Reply<()>,
     },
     Drain(String, Reply<u32>),
+    /// Asks all workers to check their machines.
+    Examine(Examine, Reply<Asked>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
     /// Returns which connected workers could run a planned job.
     EligibleWorkers(Arc<JobSpec>, Reply<EligibleWorkers>),
     /// Returns this instance's knowledge without a query to the catalog.
     FarmSnapshot(Reply<FarmSnapshot>),
+    /// Returns the seconds until the open stages of jobs are done, as far as known.
+    Forecasts(Reply<BTreeMap<JobId, u64>>),
     /// Returns the tasks that wait for workers of a shape.
     Demand(Box<Shape>, Reply<Demand>),
     JobSnapshot {
@@ -151,10 +155,12 @@ pub(super) fn refuse(command: Command, error: &str) {
         }
         Command::Overlay(_, reply) => no(reply, error),
         Command::Drain(_, reply) => no(reply, error),
+        Command::Examine(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),
         Command::EligibleWorkers(_, reply) => no(reply, error),
         Command::FarmSnapshot(reply) => no(reply, error),
+        Command::Forecasts(reply) => no(reply, error),
         Command::Demand(_, reply) => no(reply, error),
         Command::JobSnapshot { reply, .. } => no(reply, error),
     }

@@ -6,14 +6,14 @@ mod handle;
 mod reports;
 
 use std::{
-    collections::{HashMap, hash_map::Entry},
+    collections::{BTreeMap, HashMap, hash_map::Entry},
     panic::AssertUnwindSafe,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use futures::FutureExt;
-use picofarm_catalog::{Catalog, CatalogError, Job};
+use picofarm_catalog::{Catalog, CatalogError, Job, Sight, published};
 use picofarm_proto::ids::JobId;
 use tokio::{
     sync::{mpsc, watch},
@@ -29,7 +29,7 @@ use super::{
     slow_work::SlowWork,
 };
 use crate::{
-    core::{Clock, Core, CoreQuotas, NewJob, Reported, Settings, Timings},
+    core::{Clock, Core, NewJob, Reported, Settings, Timings, UserQuotas},
     memory::{Memory, kept_cost},
     observe::{
         health::Health,
@@ -63,8 +63,8 @@ pub(crate) struct Actor {
     pub health: Arc<Health>,
     pub stop: CancellationToken,
     pub memory: Arc<Memory>,
-    /// Returns the current bounds on the cores of users.
-    pub quotas: Box<dyn Fn() -> CoreQuotas + Send + Sync>,
+    /// Returns the current bounds on users.
+    pub quotas: Box<dyn Fn() -> UserQuotas + Send + Sync>,
     pub slow_work: Arc<dyn SlowWork>,
 }
 
@@ -273,7 +273,7 @@ impl Life<'_> {
         let connected = self.core.connected();
         let news = self.actor.catalog.beat(connected, self.now()).await?;
         self.actor.health.beat();
-        self.core.set_quotas((self.actor.quotas)());
+        self.read_quotas().await?;
         let now = self.now();
         let unknown = self.core.apply_news(news, now);
         self.kept.retain(|job, _| self.core.knows(*job));
@@ -287,6 +287,19 @@ impl Life<'_> {
                 self.actor.slow_work.learn(job);
             }
         }
+        Ok(())
+    }
+
+    /// Reads the bounds on users and, if they include bytes, the bytes that all coordinators have
+    /// counted.
+    async fn read_quotas(&mut self) -> Result<(), CatalogError> {
+        let quotas = (self.actor.quotas)();
+        let published = match quotas.bytes.is_none() {
+            true => BTreeMap::new(),
+            false => published(&*self.actor.catalog, Sight::All).await?,
+        };
+        self.core.set_quotas(quotas);
+        self.core.set_published(published);
         Ok(())
     }
 

@@ -43,6 +43,11 @@ impl Caller {
         }
     }
 
+    /// Returns the caller's own bound on the bytes that its jobs publish, if any.
+    pub(crate) fn max_bytes(&self) -> Option<u64> {
+        self.entry.as_ref()?.max_bytes
+    }
+
     /// Returns whether the caller was not authenticated. Such callers cannot be distinguished.
     pub(crate) fn is_anyone(&self) -> bool {
         self.trust.is_none() && self.entry.is_none() && *self.name == *ANYONE

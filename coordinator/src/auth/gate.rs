@@ -78,11 +78,11 @@ impl Gate {
         Ok((Self { required, trust }, judge))
     }
 
-    /// Returns the callers with a bound of their own on the cores that their jobs use.
-    pub(crate) fn core_quotas(&self) -> BTreeMap<String, u32> {
+    /// Returns the callers with a bound of their own, with `bound` of each.
+    pub(crate) fn bounds<T>(&self, bound: impl Fn(&Entry) -> Option<T>) -> BTreeMap<String, T> {
         let trust = self.trust.borrow();
         let entries = trust.tokens.entries().iter();
-        let bounded = entries.filter_map(|e| Some((e.name.clone(), e.max_cores?)));
+        let bounded = entries.filter_map(|e| Some((e.name.clone(), bound(e)?)));
         bounded.collect()
     }
 

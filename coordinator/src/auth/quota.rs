@@ -17,6 +17,8 @@ pub struct Quotas {
     pub jobs_per_user: usize,
     /// Cores that the jobs of one caller use at a time; `None` for no bound.
     pub cores_per_user: Option<u32>,
+    /// Bytes that the jobs of one caller publish, over all time; `None` for no bound.
+    pub bytes_per_user: Option<u64>,
     /// Tasks of one job.
     pub tasks_per_job: u64,
     /// Concurrent worker sessions.
@@ -27,12 +29,13 @@ pub struct Quotas {
 }
 
 impl Default for Quotas {
-    /// Returns 1,000 jobs a caller, any number of cores, 10,000,000 tasks a job, 10,000 workers,
-    /// and priorities from -100 to 100.
+    /// Returns 1,000 jobs a caller, any number of cores and bytes, 10,000,000 tasks a job, 10,000
+    /// workers, and priorities from -100 to 100.
     fn default() -> Self {
         Self {
             jobs_per_user: 1_000,
             cores_per_user: None,
+            bytes_per_user: None,
             tasks_per_job: 10_000_000,
             sessions: 10_000,
             max_priority: 100,

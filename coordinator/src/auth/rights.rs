@@ -178,6 +178,7 @@ mod tests {
                 certificate: Some("c".into()),
                 expires: None,
                 max_cores: None,
+                max_bytes: None,
                 member: texts(member),
                 maintainer: texts(maintainer),
             })),

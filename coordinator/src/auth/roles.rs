@@ -121,6 +121,7 @@ pub const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/ListWorkers", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/GetDemand", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/DrainWorker", Needs::Role(Role::Admin)),
+    ("/picofarm.v1.Jobs/ExamineWorkers", Needs::Role(Role::Admin)),
     ("/picofarm.v1.Jobs/GetUsage", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ListAudit", Needs::Role(Role::Admin)),
 ];

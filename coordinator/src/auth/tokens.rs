@@ -56,6 +56,9 @@ pub struct Entry {
     /// The most cores that the caller's jobs use at a time.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_cores: Option<u32>,
+    /// The most bytes that the caller's jobs publish.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_bytes: Option<u64>,
     /// Projects that the caller may name in its jobs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub member: Vec<String>,
@@ -65,10 +68,11 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// Returns whether both give the same access. A bound on cores is none.
+    /// Returns whether both give the same access. Bounds on cores and bytes are none.
     pub(super) fn gives_access_of(&self, other: &Self) -> bool {
         let bounded = Self {
             max_cores: other.max_cores,
+            max_bytes: other.max_bytes,
             ..self.clone()
         };
         bounded == *other
@@ -88,7 +92,7 @@ const HEAD: &str = "\
 # Roles: view, submit, work, admin. sha256 is that of the token, which is kept nowhere.
 # member = [\"PROJECT\"] lets a caller name the project in its jobs; maintainer = [\"PROJECT\"] lets it change all jobs of it.
 # In place of sha256, certificate = \"NAME\" knows a client certificate by its common name or an alternative name.
-# max_cores = 64 bounds the cores that a caller's jobs use at a time.
+# max_cores = 64 bounds the cores that a caller's jobs use at a time, max_bytes = 2_000_000_000_000 the bytes that they publish.
 # expires = \"2027-03-01T08:00:00Z\" ends a caller's access at that time.
 
 ";
@@ -163,6 +167,11 @@ impl Tokens {
             if entry.max_cores == Some(0) {
                 return Err(format!(
                     "{at}: max_cores must be at least 1; leave it out for no bound"
+                ));
+            }
+            if entry.max_bytes == Some(0) {
+                return Err(format!(
+                    "{at}: max_bytes must be at least 1; leave it out for no bound"
                 ));
             }
             for project in entry.member.iter().chain(&entry.maintainer) {
@@ -296,20 +305,27 @@ impl Tokens {
             certificate: None,
             expires,
             max_cores: None,
+            max_bytes: None,
             member,
             maintainer,
         });
         Ok(Secret::new(token))
     }
 
-    /// Bounds the cores that a caller's jobs use at a time; `None` removes the bound.
+    /// Bounds the cores that a caller's jobs use at a time, and the bytes that they publish; `None`
+    /// removes a bound.
     ///
     /// # Errors
     /// Returns a message if no caller has this name.
-    pub fn bound_cores(&mut self, name: &str, most: Option<u32>) -> Result<(), String> {
+    pub fn bound(
+        &mut self,
+        name: &str,
+        cores: Option<u32>,
+        bytes: Option<u64>,
+    ) -> Result<(), String> {
         let entry = self.entries.iter_mut().find(|e| e.name == name);
         let entry = entry.ok_or_else(|| format!("there is no caller {name:?}"))?;
-        entry.max_cores = most;
+        (entry.max_cores, entry.max_bytes) = (cores, bytes);
         Ok(())
     }
 

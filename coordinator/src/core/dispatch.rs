@@ -125,6 +125,7 @@ impl Core {
         }
         let user = &self.stages[&id].job().user;
         self.within_quota(user, worker, 0)
+            .and_then(|()| self.may_publish(user))
             .map_err(NotEligible::Quota)?;
         match self.passed_over(id, worker, now_ms) {
             Some(0) => Err(

@@ -145,6 +145,13 @@ impl Load {
         self.jobs.get(&job).map_or(0, |load| load.leases)
     }
 
+    /// Returns the number of workers of all instances with leases of a job.
+    pub(super) fn workers_of_job(&self, job: JobId) -> u64 {
+        let elsewhere = self.elsewhere.get(&job).copied().unwrap_or(0);
+        let here = self.jobs.get(&job).map_or(0, |load| load.workers.len());
+        here as u64 + u64::from(elsewhere)
+    }
+
     /// Returns whether a worker has leases of a job.
     pub(super) fn works(&self, job: JobId, worker: WorkerId) -> bool {
         let load = self.jobs.get(&job);
@@ -153,9 +160,7 @@ impl Load {
 
     /// Returns how many more workers may join a job that may have `most` workers.
     pub(super) fn room(&self, job: JobId, most: u32) -> u64 {
-        let elsewhere = self.elsewhere.get(&job).copied().unwrap_or(0);
-        let here = self.jobs.get(&job).map_or(0, |load| load.workers.len());
-        u64::from(most).saturating_sub(here as u64 + u64::from(elsewhere))
+        u64::from(most).saturating_sub(self.workers_of_job(job))
     }
 
     /// Returns whether a worker may join a job that may have `most` workers. The counts of other

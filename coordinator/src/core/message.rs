@@ -1,6 +1,9 @@
 //! The messages of the core to workers.
 
-use picofarm_proto::{ids::LeaseRef, messages::Lease};
+use picofarm_proto::{
+    ids::LeaseRef,
+    messages::{Examine, Lease},
+};
 
 /// Number of a session, unique in this process.
 pub(crate) type SessionId = u64;
@@ -30,6 +33,8 @@ pub(crate) enum ToWorker {
     },
     /// Finish the current tasks, then end.
     Drain,
+    /// Check the machine.
+    Examine(Examine),
     /// The session ends because a newer one has replaced it.
     Replaced,
 }

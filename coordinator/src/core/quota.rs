@@ -1,19 +1,47 @@
-//! The bound on the cores that the jobs of one user use at a time. These are the cores of the
-//! workers with leases of these jobs. A worker counts whole, because its tasks use all its threads.
+//! The bounds on users: the cores that the jobs of one user use at a time, and the bytes that they
+//! publish. The cores are those of the workers with leases of these jobs. A worker counts whole,
+//! because its tasks use all its threads.
 
-use picofarm_proto::ids::WorkerId;
+use std::collections::BTreeMap;
 
-use super::{settings::CoreQuotas, state::Core};
+use picofarm_proto::{ids::WorkerId, show::size};
+
+use super::{settings::UserQuotas, state::Core};
 
 impl Core {
     /// Replaces the bounds. Leases beyond a lower bound stay.
-    pub(crate) fn set_quotas(&mut self, quotas: CoreQuotas) {
+    pub(crate) fn set_quotas(&mut self, quotas: UserQuotas) {
         self.quotas = quotas;
     }
 
-    /// Returns whether the user's jobs are bounded.
+    /// Replaces the bytes that the users' jobs have published.
+    pub(crate) fn set_published(&mut self, published: BTreeMap<String, u64>) {
+        self.published = published;
+    }
+
+    /// Adds bytes that a user's job has published since the sums were read.
+    pub(super) fn add_published(&mut self, user: &str, bytes: u64) {
+        if self.quotas.bytes.of(user).is_some() {
+            let sum = self.published.entry(user.to_owned()).or_default();
+            *sum = sum.saturating_add(bytes);
+        }
+    }
+
+    /// Checks whether a user's jobs may publish more.
+    ///
+    /// # Errors
+    /// Returns the bound, the bytes published, and the remedy.
+    pub(super) fn may_publish(&self, user: &str) -> Result<(), String> {
+        let used = self.published.get(user).copied().unwrap_or(0);
+        match self.quotas.bytes.of(user) {
+            Some(most) if used >= most => Err(over_bytes(user, used, most)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Returns whether the cores of the user's jobs are bounded.
     pub(super) fn has_quota(&self, user: &str) -> bool {
-        self.quotas.of(user).is_some()
+        self.quotas.cores.of(user).is_some()
     }
 
     /// Checks whether a worker may get a lease of a user's job, if the user's jobs are about to
@@ -27,7 +55,7 @@ impl Core {
         worker: WorkerId,
         more: u64,
     ) -> Result<(), String> {
-        let Some(most) = self.quotas.of(user) else {
+        let Some(most) = self.quotas.cores.of(user) else {
             return Ok(());
         };
         if self.load.works_for(user, worker) {
@@ -37,12 +65,13 @@ impl Core {
         fits((used, more), self.load.cores_of(worker), (user, most))
     }
 
-    /// Checks whether a worker with so many cores could get a lease of a user's job now.
+    /// Checks whether a new worker with so many cores could get a lease of a user's job now.
     ///
     /// # Errors
     /// Returns the bound and how much of it is used.
     pub(super) fn room_for(&self, user: &str, cores: u32) -> Result<(), String> {
-        let Some(most) = self.quotas.of(user) else {
+        self.may_publish(user)?;
+        let Some(most) = self.quotas.cores.of(user) else {
             return Ok(());
         };
         let used = self.load.cores_of_user(user);
@@ -61,4 +90,14 @@ fn fits((used, more): (u64, u64), cores: u64, (user, most): (&str, u32)) -> Resu
     Err(format!(
         "jobs of {user:?} use {used} of at most {most} cores, and the worker has {cores}"
     ))
+}
+
+/// Describes a user's jobs that have published as many bytes as they may.
+pub(crate) fn over_bytes(user: &str, used: u64, most: u64) -> String {
+    format!(
+        "jobs of {user:?} have published {} of at most {}; deleted results count too, so only a higher bound helps: max_bytes of \
+         the caller in the token file, or --max-bytes-per-user at the coordinator",
+        size(used),
+        size(most)
+    )
 }

@@ -3,7 +3,7 @@
 use picofarm_catalog::{Range, Worker};
 use picofarm_proto::{
     ids::{LeaseRef, WorkerId},
-    messages::WorkerHello,
+    messages::{Examine, WorkerHello},
 };
 
 use super::{
@@ -11,6 +11,22 @@ use super::{
     state::Core,
     workers::WorkerEntry,
 };
+
+/// Workers that were asked to check their machines.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Asked {
+    pub workers: Vec<AskedWorker>,
+    /// Number of workers connected to other coordinators.
+    pub elsewhere: u32,
+}
+
+/// A worker that was asked to check its machine.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct AskedWorker {
+    pub session: SessionId,
+    pub id: String,
+    pub name: String,
+}
 
 impl Core {
     /// Connects a worker. Leases that it still has stay live. Leases that it does not know become
@@ -122,6 +138,24 @@ impl Core {
             }
         }
         count
+    }
+
+    /// Asks all connected workers to check their machines.
+    pub(crate) fn examine(&mut self, what: &Examine) -> Asked {
+        let mut asked = Asked {
+            workers: Vec::new(),
+            elsewhere: self.peers.workers(),
+        };
+        for (id, entry) in self.workers.iter() {
+            let ask = ToWorker::Examine(what.clone());
+            self.outcome.send(entry.session, ask);
+            asked.workers.push(AskedWorker {
+                session: entry.session,
+                id: id.to_string(),
+                name: entry.name.clone(),
+            });
+        }
+        asked
     }
 
     /// Ends a session. Leases that were not returned stay live for a moment, because the worker may

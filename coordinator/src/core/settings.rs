@@ -30,18 +30,41 @@ pub(crate) struct Settings {
     pub slow_ms: u32,
 }
 
-/// The most cores that each user's jobs use at a time.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub(crate) struct CoreQuotas {
+/// A bound for each user.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Bound<T> {
     /// The bound for users without one of their own; `None` for no bound.
-    pub every: Option<u32>,
+    pub every: Option<T>,
     /// The bounds of single users.
-    pub of: BTreeMap<String, u32>,
+    pub of: BTreeMap<String, T>,
 }
 
-impl CoreQuotas {
+impl<T> Default for Bound<T> {
+    fn default() -> Self {
+        Self {
+            every: None,
+            of: BTreeMap::new(),
+        }
+    }
+}
+
+impl<T: Copy> Bound<T> {
     /// Returns the bound of a user, if any.
-    pub(super) fn of(&self, user: &str) -> Option<u32> {
+    pub(crate) fn of(&self, user: &str) -> Option<T> {
         self.of.get(user).copied().or(self.every)
     }
+
+    /// Returns whether no user is bounded.
+    pub(crate) fn is_none(&self) -> bool {
+        self.every.is_none() && self.of.is_empty()
+    }
+}
+
+/// The bounds on users.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(crate) struct UserQuotas {
+    /// Cores that a user's jobs use at a time.
+    pub cores: Bound<u32>,
+    /// Bytes that a user's jobs publish, over all time.
+    pub bytes: Bound<u64>,
 }

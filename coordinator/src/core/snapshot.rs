@@ -47,6 +47,8 @@ pub(crate) struct JobSnapshot {
     pub running: Option<RunningOn>,
     /// Pools of workers that other programs start.
     pub pools: Vec<PoolFit>,
+    /// Why the jobs of the job's user may publish nothing more.
+    pub over_bytes: Option<String>,
 }
 
 impl Core {
@@ -198,6 +200,7 @@ impl Core {
             elsewhere: self.peers.workers(),
             running: task.and_then(|task| self.running_on(entry, task)),
             pools: self.pools_for(here, now_ms),
+            over_bytes: self.may_publish(&entry.job().user).err(),
         }
     }
 

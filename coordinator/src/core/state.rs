@@ -3,7 +3,7 @@
 //! Each part has private fields, and the methods that need only that part. `Core` has the methods
 //! that need two, in one file for each subject.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use picofarm_catalog::{Changes, Job, ResultSet, Settled, Snapshot, StageRecord, Timing};
 use picofarm_proto::ids::{JobId, RangeId, StageRef};
@@ -19,7 +19,7 @@ use super::{
     pools::Pools,
     refunds::Refunds,
     second_runs::SecondRuns,
-    settings::{CoreQuotas, MakeId, Settings},
+    settings::{MakeId, Settings, UserQuotas},
     stages::Stages,
     store_faults::StoreFaults,
     workers::Workers,
@@ -36,8 +36,10 @@ pub(crate) struct Core {
     pub(super) leases: Leases,
     /// Which workers run which job.
     pub(super) load: Load,
-    /// The most cores that each user's jobs use.
-    pub(super) quotas: CoreQuotas,
+    /// The bounds on users.
+    pub(super) quotas: UserQuotas,
+    /// Bytes that the jobs of each bounded user have published.
+    pub(super) published: BTreeMap<String, u64>,
     /// Tasks that run a second time.
     pub(super) second_runs: SecondRuns,
     /// Unavailable stores for which tasks wait.
@@ -74,7 +76,8 @@ impl Core {
             workers: Workers::with_names(names),
             leases: Leases::default(),
             load: Load::default(),
-            quotas: CoreQuotas::default(),
+            quotas: UserQuotas::default(),
+            published: BTreeMap::new(),
             second_runs: SecondRuns::default(),
             store_faults: StoreFaults::default(),
             doubts: Doubts::default(),

@@ -29,6 +29,10 @@ impl Core {
             failures: 0,
         };
         self.outcome.record_usage(day_of(now_ms), id.job, usage);
+        let user = self.stages.get(&id).map(|entry| entry.job().user.clone());
+        if let Some(user) = user {
+            self.add_published(&user, usage.bytes);
+        }
     }
 
     /// Counts a failed attempt.

@@ -26,7 +26,7 @@ use super::{
 use crate::{
     actor::{Actor, Lanes, forget},
     auth::{Access, Gate, METHODS, OwnCode, Quotas, TokenError},
-    core::{Backoff, Clock, CoreQuotas, Settings},
+    core::{Backoff, Bound, Clock, Settings, UserQuotas},
     memory::{Memory, MemoryBounds},
     observe::{
         audit::Audit,
@@ -285,10 +285,16 @@ async fn start(
         stop: shutdown.clone(),
         memory: Arc::clone(&memory),
         quotas: {
-            let (gate, every) = (gate.clone(), config.quotas.cores_per_user);
-            Box::new(move || CoreQuotas {
-                every,
-                of: gate.core_quotas(),
+            let (gate, every) = (gate.clone(), config.quotas);
+            Box::new(move || UserQuotas {
+                cores: Bound {
+                    every: every.cores_per_user,
+                    of: gate.bounds(|entry| entry.max_cores),
+                },
+                bytes: Bound {
+                    every: every.bytes_per_user,
+                    of: gate.bounds(|entry| entry.max_bytes),
+                },
             })
         },
         slow_work: Arc::new(submissions.clone()),
@@ -306,6 +312,7 @@ async fn start(
         heartbeat_ms: config.heartbeat_ms,
         lanes,
         submissions,
+        examinations: Arc::default(),
     };
     if let Some((listener, address)) = endpoint {
         let pages = Pages {

@@ -41,6 +41,8 @@ pub struct JobFacts {
     pub elsewhere: u32,
     /// Pools of workers that other programs start.
     pub pools: Vec<PoolFit>,
+    /// Why the jobs of the user may publish nothing more.
+    pub over_bytes: Option<String>,
     /// Currently running tasks.
     pub running: Vec<RunningTask>,
     /// Latest history line that explains an interruption: a failure, a returned task or an expired

@@ -12,7 +12,7 @@ use picofarm_proto::{
 use super::{
     facts::JobFacts,
     reason::{n, reason},
-    waits::{over_quota, short_of_time, waits_for_jobs},
+    waits::{over_bytes, over_quota, short_of_time, waits_for_jobs},
 };
 use crate::core::{Candidate, NotEligible, span};
 
@@ -125,6 +125,10 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
     }
     if !after.is_empty() {
         reasons.push(waits_for_jobs(facts, after));
+        return;
+    }
+    if let Some(why) = facts.over_bytes.as_ref().filter(|_| *ready > 0) {
+        reasons.push(over_bytes(*ready, why));
         return;
     }
     let shared = facts.shared.min(*ready);

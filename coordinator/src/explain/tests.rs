@@ -43,6 +43,7 @@ fn facts() -> JobFacts {
         unseen: 0,
         elsewhere: 0,
         pools: vec![],
+        over_bytes: None,
         running: vec![],
         setback: None,
         now_ms: NOW,

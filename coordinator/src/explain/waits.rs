@@ -51,6 +51,15 @@ pub(super) fn over_quota(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> O
     Some(reason("quota", ready, words))
 }
 
+/// Explains tasks of a user whose jobs have published as many bytes as they may.
+pub(super) fn over_bytes(ready: u64, why: &str) -> Reason {
+    let words = format!(
+        "{} wait for the quota of their user: {why}",
+        n(ready, "task")
+    );
+    reason("quota_bytes", ready, words)
+}
+
 /// Explains the case in which every able worker ends too early.
 pub(super) fn short_of_time(facts: &JobFacts, ready: u64, able: &[&Candidate]) -> Option<Reason> {
     if able.iter().any(|c| c.lacks_time.is_none()) {

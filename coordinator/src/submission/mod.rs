@@ -27,3 +27,4 @@ pub(crate) use prepare::{prepare, reuses_job};
 pub(crate) use draft::Draft;
 pub use result_reader::{ResultReader, ResultState};
 pub(crate) use service::Submissions;
+pub(crate) use submit::UserLimits;

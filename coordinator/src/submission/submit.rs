@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use picofarm_catalog::{Gone, Outcome, OwnedPlace, Owner, Run, Submission};
+use picofarm_catalog::{Gone, Outcome, OwnedPlace, Owner, Run, Sight, Submission, published};
 use picofarm_proto::{
     ids::JobId,
     messages::{JobPlan, JobState},
@@ -20,7 +20,17 @@ use super::{
 use crate::{
     actor::{Refusal, Submitted},
     auth::{Caller, not_owner},
+    core::over_bytes,
 };
+
+/// A caller's limits on its jobs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct UserLimits {
+    /// Unfinished jobs.
+    pub jobs: u64,
+    /// Bytes that the jobs publish, over all time; `None` for no bound.
+    pub bytes: Option<u64>,
+}
 
 /// Most attempts to plan a submission again because the catalog changed meanwhile.
 const ATTEMPTS: usize = 4;
@@ -61,12 +71,12 @@ impl Submissions {
         Ok(())
     }
 
-    /// Records a job, unless an existing one is reused. `most` limits the caller's unfinished jobs.
+    /// Records a job, unless an existing one is reused.
     pub(crate) async fn submit(
         &self,
         draft: &Arc<Draft>,
         by: &Caller,
-        most: u64,
+        most: UserLimits,
         again: bool,
     ) -> Result<Submitted, Refusal> {
         self.in_time(draft)?;
@@ -98,12 +108,33 @@ impl Submissions {
         ))
     }
 
+    /// Checks a caller's limits before another job of it is recorded.
+    async fn within(&self, user: &str, most: UserLimits) -> Result<(), Refusal> {
+        if self.catalog.unfinished_jobs(user).await.map_err(broken)? >= most.jobs {
+            return Err(Refusal::TooMany(format!(
+                "{user:?} has {} jobs that have not ended, the most that --max-jobs-per-user allows; wait for some to end, or \
+                 cancel some",
+                most.jobs
+            )));
+        }
+        if let Some(most) = most.bytes {
+            let published = published(&*self.catalog, Sight::All)
+                .await
+                .map_err(broken)?;
+            let used = published.get(user).copied().unwrap_or(0);
+            if used >= most {
+                return Err(Refusal::TooMany(over_bytes(user, used, most)));
+            }
+        }
+        Ok(())
+    }
+
     /// Records the job. Returns `None` if the catalog has changed since the job was considered.
     async fn record(
         &self,
         draft: &Arc<Draft>,
         by: &Caller,
-        most: u64,
+        most: UserLimits,
         (considered, after): (Considered, Vec<JobId>),
     ) -> Result<Option<Submitted>, Refusal> {
         let (plan, owner) = (considered.plan, by.name.to_string());
@@ -116,18 +147,24 @@ impl Submissions {
         let anyone = by.is_anyone();
         let recorded = self.heavy(draft, move |it, draft| async move {
             let _turn = it.turn.lock().await;
-            if it.catalog.unfinished_jobs(&owner).await.map_err(broken)? >= most {
-                return Err(Refusal::TooMany(format!(
-                    "{owner:?} has {most} jobs that have not ended, the most that --max-jobs-per-user allows; wait for \
-                     some to end, or cancel some"
-                )));
-            }
-            it.memory.room_for_job(draft.kept).map_err(Refusal::TooMany)?;
+            it.within(&owner, most).await?;
+            it.memory
+                .room_for_job(draft.kept)
+                .map_err(Refusal::TooMany)?;
             let counts: Vec<Vec<Run>> = findings.iter().map(|f| f.counts.clone()).collect();
             let mut make_id = Uuid::now_v7;
-            let prepared = prepare(&draft, owner, &circle, &counts, &mut make_id, it.clock.now_ms());
+            let prepared = prepare(
+                &draft,
+                owner,
+                &circle,
+                &counts,
+                &mut make_id,
+                it.clock.now_ms(),
+            );
             let dropped = findings.iter().zip(draft.stages());
-            let gone: Vec<Gone> = dropped.flat_map(|(f, stage)| f.dropped(&stage.set)).collect();
+            let gone: Vec<Gone> = dropped
+                .flat_map(|(f, stage)| f.dropped(&stage.set))
+                .collect();
             let owner = Owner::from(&prepared.job);
             // Without tokens, all users are the same caller, who owns nothing.
             let places = match anyone {
@@ -135,7 +172,8 @@ impl Submissions {
                 false => places::written(&draft.spec.stages, &prepared.stages, &owner),
             };
             let places: Vec<OwnedPlace> = places.into_iter().map(|(_, place)| place).collect();
-            it.commit(prepared, (&gone, &after), instead_of, (&places, &permitted)).await
+            it.commit(prepared, (&gone, &after), instead_of, (&places, &permitted))
+                .await
         });
         let Some(job) = recorded.await? else {
             return Ok(None);

@@ -1,6 +1,7 @@
 //! Conversions between wire types and the model. Every error names the invalid field.
 
 mod audit;
+mod examine;
 mod explain;
 mod job;
 mod session;

@@ -203,6 +203,7 @@ impl From<JobSummary> for wire::JobSummary {
             submitted_at_ms: m.submitted_at_ms,
             ended_at_ms: m.ended_at_ms.unwrap_or(0),
             number: m.number,
+            left_s: m.left_s.unwrap_or(0),
         }
     }
 }
@@ -222,6 +223,7 @@ impl TryFrom<wire::JobSummary> for JobSummary {
             tasks: required(w.tasks, "job.tasks")?.into(),
             submitted_at_ms: w.submitted_at_ms,
             ended_at_ms: (w.ended_at_ms != 0).then_some(w.ended_at_ms),
+            left_s: (w.left_s != 0).then_some(w.left_s),
         })
     }
 }

@@ -78,6 +78,89 @@ pub struct PoolWorker {
     #[prost(uint64, tag = "2")]
     pub tasks: u64,
 }
+/// Check the machine, and answer with Examined while the tasks go on. Workers that do not know this message ignore it.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Examine {
+    #[prost(uint64, tag = "1")]
+    pub id: u64,
+    /// A path or URL to put, read and delete a small object in; empty = none.
+    #[prost(string, tag = "2")]
+    pub store: ::prost::alloc::string::String,
+    /// A file or folder with scenes to read; empty = none.
+    #[prost(string, tag = "3")]
+    pub scenes: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Examined {
+    /// As in Examine.
+    #[prost(uint64, tag = "1")]
+    pub id: u64,
+    /// The worker's clock when it sent this, Unix time in milliseconds.
+    #[prost(int64, tag = "2")]
+    pub clock_ms: i64,
+    /// At most 16.
+    #[prost(message, repeated, tag = "3")]
+    pub checks: ::prost::alloc::vec::Vec<Check>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Check {
+    /// store, memory, …; at most 32 bytes.
+    #[prost(string, tag = "1")]
+    pub what: ::prost::alloc::string::String,
+    #[prost(enumeration = "Verdict", tag = "2")]
+    pub verdict: i32,
+    /// For people; at most 1 KiB.
+    #[prost(string, tag = "3")]
+    pub detail: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ExaminedWorker {
+    #[prost(string, tag = "1")]
+    pub id: ::prost::alloc::string::String,
+    #[prost(string, tag = "2")]
+    pub name: ::prost::alloc::string::String,
+    /// It answered in time; otherwise it has no checks.
+    #[prost(bool, tag = "3")]
+    pub answered: bool,
+    /// By how much its clock is ahead of the coordinator's, milliseconds, to within the time of one message.
+    #[prost(int64, tag = "4")]
+    pub ahead_ms: i64,
+    #[prost(message, repeated, tag = "5")]
+    pub checks: ::prost::alloc::vec::Vec<Check>,
+}
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Verdict {
+    Unspecified = 0,
+    Ok = 1,
+    /// Tasks run without it.
+    Note = 2,
+    Bad = 3,
+}
+impl Verdict {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "VERDICT_UNSPECIFIED",
+            Self::Ok => "VERDICT_OK",
+            Self::Note => "VERDICT_NOTE",
+            Self::Bad => "VERDICT_BAD",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "VERDICT_UNSPECIFIED" => Some(Self::Unspecified),
+            "VERDICT_OK" => Some(Self::Ok),
+            "VERDICT_NOTE" => Some(Self::Note),
+            "VERDICT_BAD" => Some(Self::Bad),
+            _ => None,
+        }
+    }
+}
 /// A checked job, as JSON: the same fields and names as in a job file, every default filled in. One description of jobs
 /// serves file, catalog and wire; what this version does not know is refused with the field's name.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -154,6 +237,9 @@ pub struct JobSummary {
     /// Counts the jobs of a farm from 1.
     #[prost(uint64, tag = "10")]
     pub number: u64,
+    /// Seconds until its open stages are done, at the pace of its workers; 0 = not known.
+    #[prost(uint64, tag = "11")]
+    pub left_s: u64,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct StageStatus {
@@ -539,9 +625,11 @@ pub struct ConnectedWorker {
     #[prost(string, tag = "10")]
     pub note: ::prost::alloc::string::String,
 }
+/// A coordinator ends a session with a message that it does not know. A worker therefore sends messages of later versions only
+/// as answers to a request.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
-    #[prost(oneof = "session_request::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    #[prost(oneof = "session_request::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
     pub message: ::core::option::Option<session_request::Message>,
 }
 /// Nested message and enum types in `SessionRequest`.
@@ -562,11 +650,13 @@ pub mod session_request {
         Release(super::Release),
         #[prost(message, tag = "7")]
         Log(super::TaskLog),
+        #[prost(message, tag = "8")]
+        Examined(super::Examined),
     }
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionResponse {
-    #[prost(oneof = "session_response::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    #[prost(oneof = "session_response::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
     pub message: ::core::option::Option<session_response::Message>,
 }
 /// Nested message and enum types in `SessionResponse`.
@@ -587,6 +677,8 @@ pub mod session_response {
         Trim(super::Trim),
         #[prost(message, tag = "7")]
         Drain(super::Drain),
+        #[prost(message, tag = "8")]
+        Examine(super::Examine),
     }
 }
 /// First message of a session. A reconnecting worker names the leases it still holds.
@@ -1474,6 +1566,27 @@ pub struct DrainWorkerResponse {
     #[prost(uint32, tag = "1")]
     pub workers: u32,
 }
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ExamineWorkersRequest {
+    /// As in Examine.
+    #[prost(string, tag = "1")]
+    pub store: ::prost::alloc::string::String,
+    /// As in Examine.
+    #[prost(string, tag = "2")]
+    pub scenes: ::prost::alloc::string::String,
+    /// How long to wait for answers; 0 = 30 s, at most a minute.
+    #[prost(uint32, tag = "3")]
+    pub within_ms: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ExamineWorkersResponse {
+    /// By name.
+    #[prost(message, repeated, tag = "1")]
+    pub workers: ::prost::alloc::vec::Vec<ExaminedWorker>,
+    /// Workers connected to other coordinators, which were not asked.
+    #[prost(uint32, tag = "2")]
+    pub elsewhere: u32,
+}
 /// Generated client implementations.
 pub mod jobs_client {
     #![allow(
@@ -1945,6 +2058,31 @@ pub mod jobs_client {
                 .insert(GrpcMethod::new("picofarm.v1.Jobs", "DrainWorker"));
             self.inner.unary(req, path, codec).await
         }
+        /// Every worker connected to this coordinator checks its machine and its access to a store.
+        pub async fn examine_workers(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ExamineWorkersRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ExamineWorkersResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = crate::codec::SmallCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/picofarm.v1.Jobs/ExamineWorkers",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("picofarm.v1.Jobs", "ExamineWorkers"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Who did what, newest first; for administrators.
         pub async fn list_audit(
             &mut self,
@@ -2125,6 +2263,14 @@ pub mod jobs_server {
             request: tonic::Request<super::DrainWorkerRequest>,
         ) -> std::result::Result<
             tonic::Response<super::DrainWorkerResponse>,
+            tonic::Status,
+        >;
+        /// Every worker connected to this coordinator checks its machine and its access to a store.
+        async fn examine_workers(
+            &self,
+            request: tonic::Request<super::ExamineWorkersRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ExamineWorkersResponse>,
             tonic::Status,
         >;
         /// Who did what, newest first; for administrators.
@@ -2898,6 +3044,51 @@ pub mod jobs_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = DrainWorkerSvc(inner);
+                        let codec = crate::codec::SmallCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/picofarm.v1.Jobs/ExamineWorkers" => {
+                    #[allow(non_camel_case_types)]
+                    struct ExamineWorkersSvc<T: Jobs>(pub Arc<T>);
+                    impl<
+                        T: Jobs,
+                    > tonic::server::UnaryService<super::ExamineWorkersRequest>
+                    for ExamineWorkersSvc<T> {
+                        type Response = super::ExamineWorkersResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ExamineWorkersRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Jobs>::examine_workers(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ExamineWorkersSvc(inner);
                         let codec = crate::codec::SmallCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

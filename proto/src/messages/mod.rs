@@ -1,6 +1,7 @@
 //! The messages of coordinator, workers and clients in checked form. Wire types convert into them.
 
 pub mod audit;
+pub mod examine;
 pub mod explain;
 pub mod lease;
 pub mod log;
@@ -8,6 +9,7 @@ pub mod status;
 pub mod usage;
 
 pub use audit::{Act, AuditEntry, Outcome};
+pub use examine::{Check, Examine, Examined, ExaminedWorker, Verdict};
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use lease::{
     Abilities, Failure, FailureKind, Finished, Lease, TaskAt, TaskProgress, WorkerHello,

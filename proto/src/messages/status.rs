@@ -165,6 +165,8 @@ pub struct JobSummary {
     pub submitted_at_ms: i64,
     /// Unix time of the end, milliseconds.
     pub ended_at_ms: Option<i64>,
+    /// Seconds until its open stages are done, at the pace of its workers, if known.
+    pub left_s: Option<u64>,
 }
 
 /// The effect of a submission.

@@ -48,7 +48,7 @@ pub use refused::{Culprit, Row, culprits, verdict};
 pub use rights::{AuditQuery, NewAudit, OwnedPlace, Owner, Rights, Sight};
 pub use submission::{Gone, Outcome, Recorded, Submission};
 pub use task::{Exception, Output, TaskRecord};
-pub use usage::{NewUsage, UsageQuery, day_of};
+pub use usage::{NewUsage, UsageQuery, day_of, published};
 
 /// The location of a catalog that can be opened. Its text never shows a password.
 #[async_trait]

@@ -8,7 +8,7 @@ use picofarm_proto::{
     messages::{Usage, UsageBy},
 };
 
-use crate::Sight;
+use crate::{Catalog, CatalogError, Sight};
 
 /// New usage by day (since 1970-01-01, UTC) and job.
 pub type NewUsage = BTreeMap<(i64, JobId), Usage>;
@@ -32,4 +32,22 @@ pub struct UsageQuery {
     pub until_day: i64,
     /// Only usage of jobs that this reader may see.
     pub sight: Sight,
+}
+
+/// Returns the bytes that each user's jobs have published, of the jobs that the reader may see.
+///
+/// # Errors
+/// Returns a [`CatalogError`] if the catalog fails.
+pub async fn published(
+    catalog: &dyn Catalog,
+    sight: Sight,
+) -> Result<BTreeMap<String, u64>, CatalogError> {
+    let query = UsageQuery {
+        by: UsageBy::User,
+        since_day: i64::MIN,
+        until_day: i64::MAX,
+        sight,
+    };
+    let rows = catalog.usage(&query).await?.into_iter();
+    Ok(rows.map(|row| (row.name, row.usage.bytes)).collect())
 }

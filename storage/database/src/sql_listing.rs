@@ -98,6 +98,7 @@ macro_rules! listing_queries {
                     tasks,
                     submitted_at_ms: row.try_get("submitted_ms")?,
                     ended_at_ms: row.try_get("ended_ms")?,
+                    left_s: None,
                 })
             }
 

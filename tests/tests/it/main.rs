@@ -19,6 +19,7 @@ mod dataops;
 mod deleted;
 mod demo;
 mod demultiplex;
+mod doctor_farm;
 mod everyday;
 mod evidence;
 mod figure;

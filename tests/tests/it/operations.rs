@@ -184,3 +184,44 @@ fn a_coordinator_whose_database_is_gone_is_alive_and_not_ready_and_comes_back() 
     postgres.up();
     until_code(&format!("{http}/readyz"), 200);
 }
+
+#[test]
+fn a_job_shows_the_jobs_and_the_quota_that_it_waits_for() {
+    let scratch = Scratch::new("waits");
+    let cli = Cli::new(scratch.path());
+    let args = [
+        "coordinator",
+        "--allow-insecure",
+        "--json",
+        "--listen",
+        "127.0.0.1:0",
+    ];
+    let bound = ["--max-bytes-per-user", "1kB"];
+    let mut coordinator = cli.start("coordinator", &[&args[..], &bound].concat());
+    let line: Value = serde_json::from_str(&coordinator.first_line()).expect("it prints JSON");
+    let url = line["coordinator"].as_str().expect("it names its address");
+    let cli = cli.with("PICOFARM_COORDINATOR", url);
+    let submit = |name: &str, head: &str| {
+        let mut job = Job::quick(&scratch.join("store"), 200);
+        job.name = name.into();
+        let file = scratch.join(&format!("{name}.toml"));
+        std::fs::write(&file, format!("{head}{}", job.toml())).expect("it is writable");
+        cli.run(&["job", "submit", &file.display().to_string()])
+    };
+    submit("first", "").ok();
+    submit("second", "after = [1]\n").ok();
+    let status = |job: &str| cli.json(&["job", "status", job]);
+    assert_eq!(status("1")["waits_for"], serde_json::json!([]));
+    assert_eq!(status("2")["waits_for"][0]["code"], "after");
+    let shown = cli.run(&["job", "status", "2"]).ok().stdout;
+    assert!(shown.contains("not begun until other jobs are done") && shown.contains("job 1"));
+
+    let _worker = worker(&cli, "only");
+    let waits = until("the quota", || {
+        let waits = status("1")["waits_for"][0].clone();
+        (waits["code"] == "quota_bytes").then_some(waits)
+    });
+    let words = waits["words"].as_str().expect("it has words");
+    assert!(words.contains("at most 1.0 kB"), "{words}");
+    submit("third", "").fails(7, &["at most 1.0 kB", "--max-bytes-per-user"]);
+}

@@ -26,6 +26,7 @@ use crate::{
     allow::StorePrefixes,
     assignments::Assignments,
     backoff::{Backoff, random},
+    examine::Examiner,
     lanes::Lanes,
     log::{TaskLine, Unsent},
     message::Outgoing,
@@ -85,6 +86,7 @@ async fn work(
         coordinator = config.coordinator, "worker starts");
     let mut agent = Agent {
         assignments: Assignments::new(),
+        examiner: Examiner::new(Arc::clone(&executor), allowed.clone()),
         lanes: Lanes::start(executor, config.threads, allowed)?,
         unsent: Unsent::default(),
         log_at: Instant::now(),
@@ -119,6 +121,7 @@ async fn work(
 struct Agent {
     assignments: Assignments,
     lanes: Lanes,
+    examiner: Examiner,
     /// Unsent log lines of tasks.
     unsent: Unsent,
     /// The next time to send the logs of the running tasks.
@@ -166,6 +169,11 @@ impl Agent {
                 event = self.link.event() => self.link_event(event)?,
                 (lease, index, lines, result) = self.lanes.finished() => {
                     self.task_ended((lease, index), lines, result);
+                }
+                examined = self.examiner.finished() => {
+                    if let Link::Up { session, .. } = &self.link {
+                        session.send(Outgoing::Examined(examined));
+                    }
                 }
                 () = tokio::time::sleep_until(wake.into()) => {}
                 () = shutdown.cancelled(), if !stopping => self.begin_leaving(Haste::Stop),

@@ -72,6 +72,17 @@ impl StorePrefixes {
         inputs.try_for_each(|(field, path)| self.allowed(&field, path))
     }
 
+    /// Checks whether the worker may access a place.
+    ///
+    /// # Errors
+    /// The reason, with the field.
+    pub(crate) fn may_use(&self, field: &str, place: &str) -> Result<(), String> {
+        match self.0.is_empty() {
+            true => Ok(()),
+            false => self.allowed(field, place),
+        }
+    }
+
     /// Returns whether a path or URL is inside one of the prefixes.
     pub fn hold(&self, text: &str) -> bool {
         StorePath::parse(text).is_ok_and(|place| self.0.iter().any(|prefix| place.lies_in(prefix)))

@@ -279,7 +279,7 @@ proptest! {
                         match message {
                             Outgoing::Report(report) => wire.push(report),
                             Outgoing::Credit(n) => prop_assert_eq!(n, 1),
-                            Outgoing::Heartbeat { .. } | Outgoing::Log(_) => unreachable!(),
+                            Outgoing::Heartbeat { .. } | Outgoing::Log(_) | Outgoing::Examined(_) => unreachable!(),
                         }
                     }
                 }

@@ -14,7 +14,7 @@ use std::{
 use picofarm_proto::{
     ids::JobId,
     key::{StageKey, TaskKey, task_key},
-    messages::TaskAt,
+    messages::{Check, Examine, TaskAt},
     spec::StageSpec,
 };
 
@@ -91,6 +91,12 @@ pub trait Executor: Send + Sync + 'static {
     /// means that the task uses all of them.
     fn together(&self, _task: &Task, _threads: usize) -> usize {
         1
+    }
+
+    /// Checks what tasks need from this machine. The places are allowed. It may block, and runs
+    /// while tasks run.
+    fn examine(&self, _what: &Examine) -> Vec<Check> {
+        Vec::new()
     }
 
     /// Runs `task` to its end, reports its progress to `control`, and stops on request.

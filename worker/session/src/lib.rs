@@ -10,6 +10,7 @@ mod assignments;
 mod assignments_laws;
 mod backoff;
 mod config;
+mod examine;
 mod executor;
 mod lanes;
 mod log;

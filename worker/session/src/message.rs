@@ -3,7 +3,7 @@
 
 use picofarm_proto::{
     ids::LeaseRef,
-    messages::{Failure, Finished, Lease, TaskLog, TaskProgress},
+    messages::{Examine, Examined, Failure, Finished, Lease, TaskLog, TaskProgress},
     spec::bounds,
     wire::{self, session_request, session_response},
 };
@@ -24,6 +24,8 @@ pub(crate) enum Outgoing {
     },
     /// Log lines of the running task.
     Log(TaskLog),
+    /// The answer to an examination.
+    Examined(Examined),
     /// A report that must be acknowledged.
     Report(Report),
 }
@@ -85,6 +87,8 @@ pub(crate) enum Incoming {
     },
     /// Finish the running task, and end.
     Drain,
+    /// Check this machine.
+    Examine(Examine),
     /// A message that this version does not understand.
     Unknown(String),
 }
@@ -104,6 +108,7 @@ impl From<Outgoing> for wire::SessionRequest {
                 progress: progress.into_iter().map(Into::into).collect(),
             }),
             Outgoing::Log(log) => M::Log(log.into()),
+            Outgoing::Examined(examined) => M::Examined(examined.into()),
             Outgoing::Report(Report::Done(done)) => M::Done(done.into()),
             Outgoing::Report(Report::Failed(failed)) => M::Failed(failed.into()),
             Outgoing::Report(Report::Release { lease, reason }) => M::Release(wire::Release {
@@ -160,6 +165,7 @@ impl Incoming {
                 None => Incoming::Unknown("a trimming without a lease".into()),
             },
             Some(M::Drain(_)) => Incoming::Drain,
+            Some(M::Examine(w)) => Incoming::Examine(w.into()),
             Some(M::Welcome(_)) => Incoming::Unknown("a second welcome".into()),
             None => Incoming::Unknown("an empty message".into()),
         }

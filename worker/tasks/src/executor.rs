@@ -6,6 +6,7 @@ use std::{
 };
 
 use picofarm_files::Opener;
+use picofarm_proto::messages::{Check, Examine};
 use picofarm_proto::spec::{
     EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
@@ -21,6 +22,7 @@ use tokio::runtime::Handle;
 #[cfg(feature = "networks")]
 use crate::{device, interpreter::Interpreter, kinds::train::has_torch};
 use crate::{
+    examine,
     input::scenes,
     stores::{STORE_PATIENCE, Stores},
     submission::Submission,
@@ -269,6 +271,10 @@ impl Executor for TaskExecutor {
 
     fn together(&self, task: &Task, threads: usize) -> usize {
         self.0.stores.together(&task.spec, threads)
+    }
+
+    fn examine(&self, what: &Examine) -> Vec<Check> {
+        examine::worker(&self.0, what)
     }
 
     fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {

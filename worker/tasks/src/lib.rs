@@ -7,13 +7,14 @@
 //! networks, and `clouds` adds stores over a network.
 //!
 //! The modules form layers. Each module imports only modules of layers below its own, and a kind of
-//! task imports no other kind. From the top: `run`, `executor`, `kinds`, `repair`, `making`,
-//! `input`, `python`, `trial`, `device`, `task`, `interpreter`, `saver`, `stores`, `submission`,
-//! `memory`, `errors`.
+//! task imports no other kind. From the top: `run`, `executor`, `examine`, `kinds`, `repair`,
+//! `making`, `input`, `python`, `trial`, `device`, `task`, `interpreter`, `saver`, `stores`,
+//! `submission`, `memory`, `errors`.
 
 #[cfg(feature = "networks")]
 mod device;
 mod errors;
+pub mod examine;
 mod executor;
 mod input;
 #[cfg(feature = "networks")]

@@ -122,7 +122,6 @@ impl Stores {
     }
 
     /// Returns the runtime that serves store requests, for threads other than the executor's.
-    #[cfg(feature = "networks")]
     pub(crate) fn runtime(&self) -> &Handle {
         &self.runtime
     }

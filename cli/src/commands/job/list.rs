@@ -53,7 +53,7 @@ fn describe(jobs: &[JobSummary], now_ms: i64) -> String {
         return "no jobs; submit one with `picofarm job submit FILE`".into();
     }
     let header = [
-        "job", "name", "user", "age", "state", "done", "dead", "total", "id",
+        "job", "name", "user", "age", "state", "done", "dead", "total", "left", "id",
     ]
     .map(String::from)
     .to_vec();
@@ -75,6 +75,8 @@ fn describe(jobs: &[JobSummary], now_ms: i64) -> String {
             done,
             j.tasks.dead.to_string(),
             j.tasks.total.to_string(),
+            j.left_s
+                .map_or_else(String::new, |s| format!("about {}", duration(s as f64))),
             j.id.to_string(),
         ]
     });

@@ -172,6 +172,7 @@ impl Farm for Memory {
             tasks: COUNTS,
             submitted_at_ms: 1_700_000_000_000,
             ended_at_ms: None,
+            left_s: None,
         };
         Ok((vec![job], Some(EVIL.into())))
     }

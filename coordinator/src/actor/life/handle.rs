@@ -121,6 +121,9 @@ impl Life<'_> {
                 Command::FarmSnapshot(reply) => {
                     let _ = reply.send(Ok(self.core.farm_snapshot(self.now())));
                 }
+                Command::Forecasts(reply) => {
+                    let _ = reply.send(Ok(self.core.forecasts()));
+                }
                 Command::Demand(shape, reply) => {
                     let now = self.now();
                     self.core.pool_asks(&shape, now);
@@ -134,6 +137,9 @@ impl Life<'_> {
                 } => {
                     let look = self.core.job_snapshot(job, stage, task, self.now());
                     let _ = reply.send(Ok(look));
+                }
+                Command::Examine(what, reply) => {
+                    let _ = reply.send(Ok(self.core.examine(&what)));
                 }
                 Command::Drain(worker, reply) => {
                     let _ = reply.send(Ok(self.core.drain(&worker)));

@@ -183,11 +183,11 @@ fn a_bound_on_cores_is_kept_in_the_file_and_changes_no_access() {
     let roles = vec![Role::Submit].into();
     tokens.create("ada", roles, vec![], vec![]).unwrap();
     let before = tokens.entries()[0].clone();
-    tokens.bound_cores("ada", Some(64)).unwrap();
-    assert!(tokens.bound_cores("eve", Some(64)).is_err());
+    tokens.bound("ada", Some(64), Some(5_000)).unwrap();
+    assert!(tokens.bound("eve", Some(64), None).is_err());
     let read = Tokens::parse(&tokens.to_text()).unwrap();
     let after = &read.entries()[0];
-    assert_eq!(after.max_cores, Some(64));
+    assert_eq!((after.max_cores, after.max_bytes), (Some(64), Some(5_000)));
     assert!(after.gives_access_of(&before));
     let other = Entry {
         member: vec!["light".into()],

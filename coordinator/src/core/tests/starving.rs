@@ -9,7 +9,7 @@ use picofarm_proto::{
 use proptest::prelude::*;
 
 use super::{
-    super::CoreQuotas,
+    super::{Bound, UserQuotas},
     block_on,
     world::{Op, World},
 };
@@ -120,9 +120,12 @@ proptest! {
         block_on(async {
             let folder = tempfile::tempdir().unwrap();
             let mut world = World::on_sqlite(folder.path()).await;
-            world.instances[0].core.set_quotas(CoreQuotas {
-                every: quota,
-                ..CoreQuotas::default()
+            world.instances[0].core.set_quotas(UserQuotas {
+                cores: Bound {
+                    every: quota,
+                    ..Bound::default()
+                },
+                ..UserQuotas::default()
             });
             for (n, (way, priority, other)) in jobs.iter().enumerate() {
                 let user = if *other { "eve" } else { "ada" };

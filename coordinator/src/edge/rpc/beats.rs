@@ -125,7 +125,7 @@ impl Beats {
                     live.left = None;
                 }
             }
-            ToWorker::Drain | ToWorker::Replaced => {}
+            ToWorker::Drain | ToWorker::Examine(_) | ToWorker::Replaced => {}
         }
         vec![say]
     }

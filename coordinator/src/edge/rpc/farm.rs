@@ -230,6 +230,11 @@ impl Listener<'_> {
             let Some(request) = input.message().await? else {
                 return Ok(());
             };
+            if let Some(From::Examined(examined)) = request.message {
+                let answer = (self.session, examined.into(), self.link.clock.now_ms());
+                self.link.examinations.answered(answer).await;
+                continue;
+            }
             let said = match checked(request).map_err(invalid)? {
                 Ok(said) => said,
                 Err(why) => {
@@ -308,6 +313,12 @@ fn checked(
             return Err(ConvertError::Invalid {
                 field: "hello",
                 what: "is only the first message of a session".into(),
+            });
+        }
+        Some(From::Examined(_)) => {
+            return Err(ConvertError::Invalid {
+                field: "examined",
+                what: "is answered before".into(),
             });
         }
         Some(From::Credit(credit)) => FromWorker::Credit(credit.leases),
@@ -390,6 +401,7 @@ fn message(say: ToWorker) -> Result<To, Status> {
             hi,
         }),
         ToWorker::Drain => To::Drain(wire::Drain {}),
+        ToWorker::Examine(what) => To::Examine(what.into()),
         ToWorker::Replaced => {
             return Err(Status::aborted(
                 "a newer session of this worker id took over; if that is another worker, give each its own id",

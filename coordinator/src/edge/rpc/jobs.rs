@@ -17,7 +17,8 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
 use super::{
-    link::{Link, account, broken, caller, invalid, refused},
+    examine::examine,
+    link::{Link, account, caller, invalid, refused},
     look,
     requests::{draft, filter, job_id, listing, usage},
     watch::watch_while_allowed,
@@ -27,7 +28,7 @@ use crate::{
     auth::{Caller, OwnCode, Quotas},
     core::VERSION,
     memory::Account,
-    submission::Draft,
+    submission::{Draft, UserLimits},
 };
 
 /// Default and largest number of events in one answer: some 4 MB with the longest messages.
@@ -102,7 +103,10 @@ impl JobsService {
         account: &Account,
     ) -> Result<Submitted, Status> {
         let draft = self.draft(request.spec, by, account).await?;
-        let most = self.quotas.jobs_per_user as u64;
+        let most = UserLimits {
+            jobs: self.quotas.jobs_per_user as u64,
+            bytes: by.max_bytes().or(self.quotas.bytes_per_user),
+        };
         let submissions = &self.link.submissions;
         let submitted = submissions.submit(&draft, by, most, request.again).await;
         submitted.map_err(refused)
@@ -162,21 +166,11 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ListJobsRequest>,
     ) -> Result<Response<wire::ListJobsResponse>, Status> {
-        let account = account(&request);
-        let by = caller(&request);
-        let sight = by.sight(self.link.visibility);
-        let query = listing(request.into_inner(), &by, sight)?;
+        let (by, account) = (caller(&request), account(&request));
+        let query = listing(request.into_inner(), &by, by.sight(self.link.visibility))?;
         let charge = account.charge("the list", LINE * u64::from(query.limit));
         let _charge = charge.await?;
-        let page = self
-            .link
-            .lanes
-            .read({
-                let catalog = Arc::clone(&self.link.catalog);
-                move || async move { catalog.page(&query).await }
-            })
-            .await
-            .map_err(broken)?;
+        let page = self.link.page(query).await?;
         Ok(Response::new(wire::ListJobsResponse {
             jobs: page.jobs.into_iter().map(Into::into).collect(),
             next_page_token: page.next.map(|key| key.to_string()).unwrap_or_default(),
@@ -395,6 +389,15 @@ impl Jobs for JobsService {
             .await?;
         let worker = worker.try_into().map_err(invalid)?;
         Ok(Response::new(look::demand(&self.link, &by, worker).await?))
+    }
+
+    async fn examine_workers(
+        &self,
+        request: Request<wire::ExamineWorkersRequest>,
+    ) -> Result<Response<wire::ExamineWorkersResponse>, Status> {
+        let account = account(&request);
+        let answer = examine(&self.link, &account, request.into_inner());
+        Ok(Response::new(answer.await?))
     }
 
     async fn get_usage(

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use picofarm_catalog::{Catalog, CatalogError, Specs};
+use picofarm_catalog::{Catalog, CatalogError, JobQuery, Page, Specs};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
@@ -14,6 +14,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Status};
 
+use super::examinations::Examinations;
 use crate::{
     actor::{Command, Lanes, Refusal, Reply},
     auth::{Caller, Visibility},
@@ -40,6 +41,8 @@ pub(crate) struct Link {
     pub heartbeat_ms: u32,
     pub lanes: Lanes,
     pub submissions: Submissions,
+    /// Examinations of workers that wait for answers.
+    pub examinations: Arc<Examinations>,
 }
 
 impl Link {
@@ -71,6 +74,19 @@ impl Link {
         let catalog = Arc::clone(&self.catalog);
         let read = self.lanes.read(move || work(catalog)).await;
         read.map_err(broken)
+    }
+
+    /// Returns a page of the list of jobs, with forecasts.
+    pub(crate) async fn page(&self, query: JobQuery) -> Result<Page, Status> {
+        let read = self.read(move |catalog| async move { catalog.page(&query).await });
+        let mut page = read.await?;
+        if page.jobs.iter().any(|job| job.state == JobState::Active) {
+            let left = self.ask(Command::Forecasts).await?;
+            for job in &mut page.jobs {
+                job.left_s = left.get(&job.id).copied();
+            }
+        }
+        Ok(page)
     }
 
     /// Returns a job's status for display.

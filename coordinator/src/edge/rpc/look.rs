@@ -67,6 +67,7 @@ pub(super) async fn explain(
         elsewhere,
         running,
         pools,
+        over_bytes,
     } = look;
     let (ahead, unseen) = seen(link, &sight, ahead).await?;
     let reasons = explain::job(&JobFacts {
@@ -86,6 +87,7 @@ pub(super) async fn explain(
         unseen,
         elsewhere,
         pools,
+        over_bytes,
         running: status.running.clone(),
         setback: setback(link, job).await?,
         now_ms,

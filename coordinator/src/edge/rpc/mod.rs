@@ -1,6 +1,8 @@
 //! The gRPC services. Protobuf types stay in this module; the rest uses the checked model.
 
 mod beats;
+mod examinations;
+mod examine;
 mod farm;
 mod jobs;
 mod link;

@@ -146,3 +146,29 @@ async fn each_text_of_each_call_is_checked_before_the_catalog_sees_it() {
         }
     }
 }
+
+#[tokio::test]
+async fn a_list_forecasts_the_time_left_of_jobs_with_workers_and_measured_tasks() {
+    let mut farm = Farm::start().await;
+    let job = farm.submit(&spec(9)).await.job_id;
+    let left = async |farm: &mut Farm| {
+        let page = list(farm, wire::ListJobsRequest::default()).await.unwrap();
+        assert_eq!(page.jobs[0].id, job);
+        page.jobs[0].left_s
+    };
+    assert_eq!(left(&mut farm).await, 0);
+    let mut worker = farm.worker().await;
+    let first = worker.lease().await;
+    let mut done = 0;
+    for index in first.lo..first.hi {
+        assert!(worker.done(&first, index).await.accepted);
+        done += 1;
+    }
+    worker.lease().await;
+    // A task takes 2 s. The catalog counts the tasks that nobody has claimed once a second.
+    let start = std::time::Instant::now();
+    while left(&mut farm).await != 2 * (9 - done) {
+        assert!(start.elapsed().as_secs() < 20, "{}", left(&mut farm).await);
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+}

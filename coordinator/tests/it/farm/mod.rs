@@ -1,6 +1,7 @@
 //! A real coordinator on loopback, driven by scripted workers and clients over gRPC.
 
 mod catalog_trouble;
+mod examine;
 mod harness;
 mod jobs;
 mod leases;

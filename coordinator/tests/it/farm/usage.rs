@@ -129,6 +129,51 @@ async fn a_user_gets_no_lease_beyond_the_quota_of_cores_and_is_told_so() {
 }
 
 #[tokio::test]
+async fn a_user_gets_no_lease_and_no_job_beyond_the_quota_of_bytes() {
+    for mut farm in Farm::start_on_each().await {
+        farm.config.quotas.bytes_per_user = Some(200);
+        farm.restart().await;
+        let job = farm.submit(&spec(9)).await.job_id;
+        let mut worker = farm.worker().await;
+        // A task publishes 100 bytes.
+        let mut published = 0;
+        while published < 200 {
+            let lease = worker.lease().await;
+            for index in lease.lo..lease.hi {
+                assert!(worker.done(&lease, index).await.accepted);
+                published += 100;
+            }
+        }
+        worker.credit(1).await;
+        let why = reasons(&mut farm, &job).await;
+        assert_eq!(why[0].code, "quota_bytes", "{why:?}");
+        let bound = format!("published {published} B of at most 200 B");
+        for part in ["wait for the quota", &bound, "--max-bytes-per-user"] {
+            assert!(why[0].words.contains(part), "{why:?}");
+        }
+        let request = wire::SubmitJobRequest {
+            spec: Some(named("second", 1).into()),
+            again: false,
+        };
+        let refused = farm.jobs.submit_job(request).await.unwrap_err();
+        assert_eq!(refused.code(), Code::ResourceExhausted);
+        assert!(refused.message().contains(&bound), "{refused:?}");
+        assert!(farm.submit(&spec(9)).await.existed);
+        // The sum outlives the process, and a higher bound lets the job end.
+        farm.restart().await;
+        let worker = farm.worker().await;
+        worker.credit(1).await;
+        let why = reasons(&mut farm, &job).await;
+        assert_eq!(why[0].code, "quota_bytes", "{why:?}");
+        farm.config.quotas.bytes_per_user = Some(1_000);
+        farm.restart().await;
+        let mut worker = farm.worker().await;
+        let status = worker.work(&mut farm, &job).await;
+        assert_eq!(status.state, JobState::Done);
+    }
+}
+
+#[tokio::test]
 async fn a_job_after_another_begins_when_that_one_is_done() {
     for mut farm in Farm::start_on_each().await {
         let first = farm.submit(&named("first", 1)).await.job_id;

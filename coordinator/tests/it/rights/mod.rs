@@ -116,6 +116,7 @@ async fn call(farm: &Farm, method: &str, who: &str, job: &str, name: &str) -> Co
                 worker: "nobody".into()
             }
         ),
+        "ExamineWorkers" => code!(examine_workers, wire::ExamineWorkersRequest::default()),
         "GetUsage" => code!(
             get_usage,
             wire::GetUsageRequest {

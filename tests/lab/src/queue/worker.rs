@@ -217,7 +217,7 @@ impl Simulated {
                     held.hi = held.hi.min(trim.hi);
                 }
             }
-            Heard::Renewed(_) | Heard::Welcome(_) | Heard::Drain(_) => {}
+            Heard::Renewed(_) | Heard::Welcome(_) | Heard::Drain(_) | Heard::Examine(_) => {}
         }
         Ok(())
     }

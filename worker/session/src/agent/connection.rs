@@ -217,6 +217,14 @@ impl Agent {
                 info!(range = %lease.range, epoch = %lease.epoch, hi, "the end of this lease is another worker's now");
                 self.assignments.trimmed(lease, hi);
             }
+            Incoming::Examine(what) => {
+                info!(
+                    store = what.store,
+                    scenes = what.scenes,
+                    "the coordinator asks for an examination of this machine"
+                );
+                self.examiner.begin(what);
+            }
             Incoming::Drain => self.begin_leaving(Haste::Finish),
             Incoming::Unknown(what) => warn!(what, "the coordinator sent a message of no use"),
         }

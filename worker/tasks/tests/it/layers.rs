@@ -3,7 +3,7 @@
 use std::{fs, path::Path};
 
 /// The modules below `src`, from the bottom layer to the top.
-const LAYERS: [&str; 16] = [
+const LAYERS: [&str; 17] = [
     "errors",
     "memory",
     "submission",
@@ -18,6 +18,7 @@ const LAYERS: [&str; 16] = [
     "making",
     "repair",
     "kinds",
+    "examine",
     "executor",
     "run",
 ];

@@ -4,11 +4,13 @@ use crate::common;
 
 use std::time::Duration;
 
-use common::{Conversation, FakeFarm, Gate, Worker, lease, output, spec, stage};
+use common::{Conversation, FakeFarm, Gate, Worker, config, lease, output, spec, stage};
 use picofarm_proto::{
     PROTOCOL,
     key::{stage_key, task_key},
-    wire::{self, FailureKind, session_response::Message as Answer},
+    wire::{
+        self, FailureKind, session_request::Message as Said, session_response::Message as Answer,
+    },
 };
 use picofarm_tasks::{AgentError, TaskError};
 use tonic::Status;
@@ -530,4 +532,58 @@ async fn a_worker_without_work_ends_when_it_was_told_to_and_not_while_it_has_som
     c.acknowledge(done.lease, 0).await;
     let summary = worker.end().await.unwrap();
     assert_eq!((summary.computed, summary.unacknowledged), (1, 0));
+}
+
+#[tokio::test]
+async fn a_worker_answers_an_examination_while_its_task_runs_and_opens_no_place_outside_its_prefixes()
+ {
+    let mut farm = FakeFarm::start().await;
+    let gate = Gate::new();
+    let held = gate.clone();
+    let mut config = config(farm.address);
+    config.store_prefixes = vec!["/nowhere".into()];
+    let mut worker = Worker::start_with(config, move |task, control| {
+        held.pass(control)?;
+        Ok(output(task))
+    });
+    let (mut c, _) = farm.welcome(60_000).await;
+    c.grant(lease(1, 0, 1)).await;
+    worker.starts().await;
+    for (id, store, expected) in [
+        (
+            7,
+            "/nowhere/store",
+            "ok store \"/nowhere/store\", scenes \"\"",
+        ),
+        (8, "/etc", "ok store \"\", scenes \"\""),
+    ] {
+        c.say(Answer::Examine(wire::Examine {
+            id,
+            store: store.into(),
+            scenes: String::new(),
+        }))
+        .await;
+        let answer = match c.next().await {
+            Some(Said::Examined(answer)) => answer,
+            other => panic!("expected an examination, got {other:?}"),
+        };
+        assert_eq!((answer.id, answer.clock_ms > 0), (id, true));
+        let first = &answer.checks[0];
+        assert_eq!(first.verdict(), wire::Verdict::Ok);
+        assert_eq!(format!("ok {}", first.detail), expected);
+        let refused = answer.checks.get(1);
+        assert_eq!(refused.is_some(), store == "/etc", "{refused:?}");
+        if let Some(refused) = refused {
+            assert_eq!(
+                (&*refused.what, refused.verdict()),
+                ("store", wire::Verdict::Bad)
+            );
+            assert!(refused.detail.contains("store prefixes"), "{refused:?}");
+        }
+    }
+    gate.open();
+    let done = c.done().await;
+    c.acknowledge(done.lease, done.index).await;
+    worker.shutdown.cancel();
+    worker.end().await.unwrap();
 }

@@ -6,7 +6,7 @@ use std::{collections::BTreeMap, net::SocketAddr, sync::Arc, time::Duration};
 use picofarm_proto::{
     ids::{Epoch, JobId, LeaseRef, RangeId},
     key::stage_key,
-    messages::Lease,
+    messages::{Check, Examine, Lease, Verdict},
     spec::{
         Budget, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec,
         TaskSpec,
@@ -325,6 +325,11 @@ impl Executor for FakeExecutor {
 
     fn assets(&self) -> Vec<String> {
         vec!["parametric-1".into()]
+    }
+
+    fn examine(&self, what: &Examine) -> Vec<Check> {
+        let detail = format!("store {:?}, scenes {:?}", what.store, what.scenes);
+        vec![Check::new("places", Verdict::Ok, detail)]
     }
 
     fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
