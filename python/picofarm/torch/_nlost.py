@@ -41,8 +41,9 @@ class Nlost(nn.Module):
         x = torch.stack([dense] if one_hot is None else [dense, one_hot], 1)
         shallow = self.msfeat(normalised(self.sig_expand(x)))
         fine = self.dsfusion(self.sig_feat(shallow))
+        coarse = self.spds(fine)
         near = self.loc_encds[0](self.posenc_l(fine))
-        far = self.glb_encds[0](self.posenc_g(self.spds(fine)))
+        far = self.glb_encds[0](self.posenc_g(coarse))
         near, far = self.locglb_inte(near, far)
         return self.dep_refine(greatest(self.inte_rec(shallow, near, far)))
 
