@@ -182,7 +182,7 @@ class Dataset:
             images = np.empty((bins[1] - bins[0], height, width), np.float32)
             ranges = ((top, top + height), (left, left + width), bins)
             self._native.read_bins(scene, name, ranges, images)
-            return images.transpose(1, 2, 0)
+            return np.transpose(images, (1, 2, 0))
         array = self._native.read(scene, name)
         if name == "normal":
             array = array.astype(np.float32) / np.float32(32767)

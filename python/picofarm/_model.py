@@ -70,16 +70,17 @@ class Model:
             if rows.shape[1] < 4:
                 raise ValueError(f"spots: expected at least 4 columns, found {rows.shape[1]}")
             spots = np.ascontiguousarray(rows[:, [0, 1, 2, -1]])
+        camera: list[float] | None = None
         if intrinsics is not None:
             values = np.asarray(intrinsics, np.float64)
             if values.shape != (4,):
                 raise ValueError(f"intrinsics: expected fx, fy, cx, cy, found shape {values.shape}")
-            intrinsics = values.tolist()
+            camera = values.tolist()
         planes = self._native.predict(
             floats("transient", transient, 3),
             None if depth is None else floats("depth", depth, 2),
             spots,
-            intrinsics,
+            camera,
             count("threads", threads),
         )
         return planes if self.question["target"] == "shadow" else planes[0]

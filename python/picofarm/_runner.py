@@ -53,7 +53,8 @@ def _descendants() -> list[int]:
         except (OSError, IndexError, ValueError):
             continue
         parents.setdefault(parent, []).append(int(name))
-    found, todo = [], [os.getpid()]
+    found: list[int] = []
+    todo = [os.getpid()]
     while todo:
         below = parents.get(todo.pop(), [])
         found += below
@@ -89,14 +90,18 @@ def _reap(work: int) -> int | None:
             found = status
 
 
+def _go_on(_signal: int, _frame: object) -> None:
+    """Handles a signal: the wake-up pipe has told of it."""
+
+
 def _supervise(watch: socket.socket, work: int, folder: str) -> NoReturn:
     """Waits for the end of the code or of the worker, whichever is first."""
-    signal.signal(signal.SIGTERM, lambda *_: None)
+    signal.signal(signal.SIGTERM, _go_on)
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     os.set_blocking(reading, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.signal(signal.SIGCHLD, _go_on)
     while True:
         status = _reap(work)
         if status is not None:
@@ -134,26 +139,36 @@ def _load_run(folder: str) -> types.ModuleType:
     return run
 
 
+def _name(requirement: str) -> str:
+    """Returns the name of a distribution, without its extras."""
+    return re.sub(r"\[.*\]", "", requirement.partition("==")[0]).strip()
+
+
 def _unmet(requirements: list[str]) -> list[str]:
-    """Returns the requirements (`name==version`) that are not installed, each with the remedy."""
+    """Returns the requirements (`name==version`) that are not installed."""
     found: list[str] = []
     for requirement in requirements:
-        name, _, wanted = requirement.partition("==")
-        name = re.sub(r"\[.*\]", "", name).strip()
+        # Hashes may follow.
+        requirement = requirement.split()[0]
+        wanted = requirement.partition("==")[2]
+        name = _name(requirement)
         try:
             have = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             found.append(f"{requirement} is not installed")
             continue
         # A local version, as in 2.9.0+cpu, satisfies its public one.
-        if have != wanted.strip() and have.partition("+")[0] != wanted.strip():
+        if have != wanted and have.partition("+")[0] != wanted:
             found.append(f"{requirement} is not installed, but {name} {have} is")
     return found
 
 
-def _facts(requirements: list[str]) -> dict[str, Any]:
+def _facts(requirements: list[str], built: bool) -> dict[str, Any]:
     """Describes the environment of the task, for its manifest."""
-    names = {re.sub(r"\[.*\]", "", text.partition("==")[0]).strip() for text in requirements}
+    names = {_name(text) for text in requirements}
+    if built:
+        # With everything that the requirements brought along.
+        names |= {found.name for found in importlib.metadata.distributions()}
     names |= {name for name in ("numpy", "torch", "jax", "picofarm") if name in sys.modules}
     versions: dict[str, str] = {}
     for name in sorted(names):
@@ -220,7 +235,7 @@ def _work(folder: str) -> int:
     except BaseException as error:
         _print_trace(error, folder)
         return 1
-    ended["facts"] = _facts(requirements)
+    ended["facts"] = _facts(requirements, bool(task.get("environment")))
     sys.stdout.flush()
     sys.stderr.flush()
     run.finish(ended)

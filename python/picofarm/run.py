@@ -29,7 +29,7 @@ import tarfile
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 __all__ = [
     "Stopped",
@@ -251,7 +251,7 @@ def _write(file: Any, state: Any) -> None:
         head("bytes")
         file.write(state)
     elif isinstance(state, os.PathLike):
-        path = os.fspath(state)
+        path = str(os.fspath(cast("os.PathLike[str]", state)))
         head("path", name=os.path.basename(os.path.normpath(path)))
         with tarfile.open(fileobj=file, mode="w|") as archive:
             archive.add(path, arcname="state")

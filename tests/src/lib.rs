@@ -29,6 +29,7 @@ pub mod shapes;
 pub mod slurm;
 pub mod store;
 pub mod wait;
+pub mod wheels;
 
 pub use batch::Batch;
 pub use browser::Browser;

@@ -5,6 +5,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use clap::{Args, Subcommand};
 use picofarm_database::CatalogPlace;
 use picofarm_settings::{Gpus, Spots};
+use serde::{Deserialize, Serialize};
 
 use super::{Guard, ranges};
 
@@ -61,10 +62,8 @@ pub struct Up {
     /// devices`
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
-    /// Python (3.10 or newer) that runs code of jobs (kind = "python"), as the user of this process
-    /// [default: no such jobs]
-    #[arg(long, value_name = "PATH", env = "PICOFARM_PYTHON_TASKS")]
-    pub python: Option<PathBuf>,
+    #[command(flatten)]
+    pub own: OwnPython,
     /// Serve no pages for a browser. Otherwise they are at 127.0.0.1:7421, or at a free port if
     /// that is in use
     #[arg(long)]
@@ -173,10 +172,8 @@ pub struct Worker {
     /// (cuda:0,cuda:1). Each is tested first
     #[arg(long, default_value = "0", value_name = "N|NAMES")]
     pub gpus: Gpus,
-    /// Python (3.10 or newer) that runs code of jobs (kind = "python"), as the user of this process
-    /// [default: no such jobs]
-    #[arg(long, value_name = "PATH", env = "PICOFARM_PYTHON_TASKS")]
-    pub python: Option<PathBuf>,
+    #[command(flatten)]
+    pub own: OwnPython,
     /// Address at which other workers reach this one to train a network together
     /// (`train.processes`). Any process that reaches it and can read the store can join
     #[arg(long, value_name = "HOST[:PORT]", default_value = "127.0.0.1")]
@@ -197,4 +194,23 @@ pub struct Worker {
     pub store_prefix: Vec<String>,
     #[command(flatten)]
     pub traces: Traces,
+}
+
+/// Options of workers that run Python code of jobs.
+#[derive(Debug, Clone, Default, Args, Serialize, Deserialize)]
+pub struct OwnPython {
+    /// Python (3.10 or newer) that runs code of jobs (kind = "python"), as the user of this process
+    /// [default: no such jobs]
+    #[arg(long, value_name = "PATH", env = "PICOFARM_PYTHON_TASKS")]
+    pub python: Option<PathBuf>,
+    /// Folder for virtual environments. What a stage requires (`python.requirements`) is installed
+    /// there once, from the index that pip or uv is set to [default: install nothing; PATH must
+    /// have it]
+    #[arg(
+        long,
+        value_name = "DIR",
+        env = "PICOFARM_PYTHON_ENVIRONMENTS",
+        requires = "python"
+    )]
+    pub python_environments: Option<PathBuf>,
 }

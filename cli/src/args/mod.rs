@@ -38,7 +38,7 @@ pub use data::{
 };
 pub use dataset::Dataset;
 pub use demultiplex::{Demultiplex, MethodArg, PlacesArg, ShadowsArg};
-pub use farm::{Coordinator, Demo, Http, Traces, Up, Worker, Workers};
+pub use farm::{Coordinator, Demo, Http, OwnPython, Traces, Up, Worker, Workers};
 pub use figure::{ColoursArg, Figure, PanelArg};
 pub use guard::{Audit, Guard, Token};
 pub use input::SceneInput;

@@ -22,7 +22,7 @@ use rooms::Rooms;
 use sheet::GrowingSheet;
 
 use crate::{
-    args::Demo,
+    args::{Demo, OwnPython},
     client::{
         Client, Submitted,
         follow::{Show, follow, verdict},
@@ -176,7 +176,7 @@ pub async fn run(args: Demo, settings: &Settings, output: Output) -> Result<()> 
     let mut farm = Local::start(
         &dir.join("catalog.sqlite"),
         any,
-        (workers, &[], None),
+        (workers, &[], &OwnPython::default()),
         settings,
         Guarded::default(),
         None,

@@ -11,6 +11,7 @@ use uuid::Uuid;
 
 use self::keeper::Keeper;
 use crate::{
+    args::OwnPython,
     commands::{
         coordinator::{Coordinator, Guarded, stored::StoreReader},
         local_worker::Order,
@@ -44,13 +45,13 @@ impl Local {
     pub async fn start(
         catalog: &Path,
         listen: SocketAddr,
-        (workers, gpus, python): (usize, &[String], Option<&Path>),
+        (workers, gpus, own): (usize, &[String], &OwnPython),
         settings: &Settings,
         mut guarded: Guarded,
         http: Option<SocketAddr>,
         otlp: Option<String>,
     ) -> Result<Self> {
-        if python.is_some() {
+        if own.python.is_some() {
             guarded.allow_python();
         }
         let open = guarded.is_open();
@@ -95,7 +96,7 @@ impl Local {
                     None => String::new(),
                 },
                 gpus: gpus.iter().skip(i).step_by(workers).cloned().collect(),
-                python: python.map(Path::to_owned),
+                own: own.clone(),
                 otlp: otlp.clone(),
                 ended: String::new(),
             };

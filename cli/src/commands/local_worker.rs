@@ -2,10 +2,7 @@
 //! reads until the line `stop`, which asks for an orderly end, or until the end of its input: then
 //! the parent has died, and the process ends at once.
 
-use std::{
-    io::{BufRead, Write},
-    path::PathBuf,
-};
+use std::io::{BufRead, Write};
 
 use picofarm_proto::ids::WorkerId;
 use picofarm_settings::Gpus;
@@ -17,6 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::worker;
 use crate::{
+    args::OwnPython,
     error::{CliError, Code, Result, io},
     settings::Settings,
     signals,
@@ -51,8 +49,8 @@ pub struct Order {
     pub memory_from: String,
     /// GPUs, by name.
     pub gpus: Vec<String>,
-    /// The Python that runs code of jobs.
-    pub python: Option<PathBuf>,
+    /// The Python that runs code of jobs, and its environments.
+    pub own: OwnPython,
     /// URL of the trace collector.
     pub otlp: Option<String>,
     /// How the previous process ended; empty for the first.
@@ -147,7 +145,8 @@ async fn work(order: Order) -> Result<()> {
         exit_idle: None,
         ends_at: crate::args::end_time::ends_at(None, std::time::SystemTime::now())?,
         asset_dirs: vec![order.settings.assets],
-        python: order.python,
+        python: order.own.python,
+        python_environments: order.own.python_environments,
         access,
         store_prefixes: Vec::new(),
     };

@@ -13,7 +13,10 @@ use std::{
     path::Path,
 };
 
-use picofarm_proto::show;
+use picofarm_proto::{
+    show,
+    spec::kinds::{Declared as _, PythonTask},
+};
 use picofarm_results::{Checkpoint, Evaluation, ModelManifest, Models, Verdict};
 use picofarm_store::open_store;
 use picofarm_store::published::Manifest as _;
@@ -207,7 +210,12 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
         row("manifest", format!("SHA-256 {}", manifest.sha256())),
         row("training key", manifest.training_key.clone()),
         row("code", from.code.clone()),
-        row("seed", from.seed.to_string()),
+    ];
+    // Own code has no seed that the farm knows.
+    if manifest.kind != PythonTask::NAME {
+        rows.push(row("seed", from.seed.to_string()));
+    }
+    rows.extend([
         row(
             "data",
             format!(
@@ -222,7 +230,7 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
                 from.split.name, from.split.version, from.split.sha256
             ),
         ),
-    ];
+    ]);
     for (name, sha256) in &from.models {
         rows.push(row("builds on", format!("{name} (SHA-256 {sha256})")));
     }

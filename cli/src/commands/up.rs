@@ -31,7 +31,7 @@ pub async fn run(args: Up, settings: &Settings, output: Output) -> Result<()> {
     let mut farm = Local::start(
         &catalog,
         args.listen,
-        (args.workers, &gpus, args.python.as_deref()),
+        (args.workers, &gpus, &args.own),
         settings,
         guarded,
         args.http.http,

@@ -39,7 +39,8 @@ pub async fn run(args: Worker, settings: &Settings, output: Output) -> Result<()
         exit_idle: args.exit_idle_s.map(Duration::from_secs),
         ends_at: end_time::ends_at(args.end_at, SystemTime::now())?,
         asset_dirs: vec![settings.assets.clone()],
-        python: args.python,
+        python: args.own.python,
+        python_environments: args.own.python_environments,
         access: settings.access()?,
         store_prefixes: args.store_prefix,
     };

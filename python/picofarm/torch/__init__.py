@@ -8,6 +8,8 @@
 Parameters have the names of the released code, so that weights fit both ways.
 """
 
+# PyTorch states some of its types only in part.
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 import os
@@ -90,7 +92,7 @@ def load(store: str | os.PathLike[str], name: str, *, device: str = "cpu") -> Mo
     Raises:
         FarmError: There is no such model.
     """
-    from safetensors.torch import load_file
+    from safetensors.torch import load_file  # pyright: ignore[reportUnknownVariableType]
 
     store = os.fspath(store)
     manifest = cast("dict[str, Any]", run(["model", "show", store, name])["manifest"])

@@ -10,7 +10,8 @@ Numbers are in files. A batch is the dense channels (f32), the bins of the one-h
 safetensors.
 """
 
-# pyright: basic
+# PyTorch states some of its types only in part.
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
 import contextlib
@@ -25,9 +26,11 @@ import struct
 import sys
 import threading
 import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
 
 import torch
-from torch import distributed, nn
+from torch import Tensor, distributed, nn
 
 from ._networks import loss, network
 
@@ -38,7 +41,7 @@ MAY_LEAVE_OUT = ("embeddings", "nlost")
 """Architectures with parameters that a batch may not reach."""
 
 
-def mapped(path, size):
+def mapped(path: str, size: int | None) -> mmap.mmap:
     """Returns a file as bytes in memory. It becomes `size` bytes long, if that is given."""
     with open(path, "r+b" if size is None else "w+b") as file:
         if size is not None:
@@ -46,12 +49,12 @@ def mapped(path, size):
         return mmap.mmap(file.fileno(), 0)
 
 
-def read_state(path):
+def read_state(path: str) -> dict[str, Tensor]:
     """Returns the tensors of a file in the format of safetensors, in f32."""
     content = mapped(path, None)
     (length,) = struct.unpack("<Q", content[:8])
-    header = json.loads(content[8 : 8 + length])
-    tensors = {}
+    header: dict[str, dict[str, Any]] = json.loads(content[8 : 8 + length])
+    tensors: dict[str, Tensor] = {}
     for name, entry in header.items():
         if name == "__metadata__":
             continue
@@ -64,9 +67,10 @@ def read_state(path):
     return tensors
 
 
-def write_state(path, tensors):
+def write_state(path: str, tensors: Mapping[str, Tensor]) -> None:
     """Writes tensors in f32 in the format of safetensors."""
-    header, at = {}, 0
+    header: dict[str, dict[str, Any]] = {}
+    at = 0
     for name, tensor in tensors.items():
         size = 4 * tensor.numel()
         shape = list(tensor.shape) or [1]
@@ -88,11 +92,13 @@ def write_state(path, tensors):
 class Batch:
     """A batch of a file, on a device."""
 
-    def __init__(self, content, shape, one_hot, device):
+    def __init__(
+        self, content: mmap.mmap, shape: Mapping[str, Any], one_hot: int, device: torch.device
+    ) -> None:
         n, h, w = shape["images"], shape["height"], shape["width"]
         at = 0
 
-        def take(channels, dtype=torch.float32):
+        def take(channels: int, dtype: torch.dtype = torch.float32) -> Tensor:
             nonlocal at
             count = n * channels * h * w
             values = torch.frombuffer(content, dtype=dtype, count=count, offset=at)
@@ -107,17 +113,24 @@ class Batch:
             self.one_hot = planes.scatter_(1, bins.clamp_min(0), (bins >= 0).float())
         self.target = take(shape["outputs"]) if shape["outputs"] else None
 
-    def inputs(self):
+    def truth(self) -> Tensor:
+        """The true outputs."""
+        if self.target is None:
+            raise ValueError("outputs: a batch of a step has no true outputs")
+        return self.target
+
+    def inputs(self) -> tuple[Tensor, ...]:
         return (self.dense,) if self.one_hot is None else (self.dense, self.one_hot)
 
 
 class Learner:
     """A network, its optimiser, and the average of its weights. One process of a group."""
 
-    def __init__(self, task, rank, world):
-        self.plan, self.rank, self.world = task["plan"], rank, world
-        spec = self.plan["net"]
-        self.target = self.plan["question"]["target"]
+    def __init__(self, task: Mapping[str, Any], rank: int, world: int) -> None:
+        self.plan: dict[str, Any] = task["plan"]
+        self.rank, self.world = rank, world
+        spec: dict[str, Any] = self.plan["net"]
+        self.target: str = self.plan["question"]["target"]
         self.device = torch.device("cpu")
         if task["gpus"]:
             if world > torch.cuda.device_count():
@@ -128,31 +141,34 @@ class Learner:
         self.half = spec.get("precision", "f32") == "bf16"
         self.network = network(spec).to(self.device)
         if task["channels_last"]:
-            self.network = self.network.to(memory_format=torch.channels_last)
+            for value in self.network.parameters():
+                if value.dim() == 4:
+                    value.data = value.data.contiguous(memory_format=torch.channels_last)
         frozen = [getattr(self.network, part, None) for part in ENCODER]
         self.frozen = [part for part in frozen if part is not None and spec.get("frozen", False)]
         for part in self.frozen:
             part.requires_grad_(False)
         self.learned = {n: p for n, p in self.network.named_parameters() if p.requires_grad}
-        self.decay, self.clip = self.plan["decay"], self.plan.get("clip_norm")
-        self.ema, self.average = self.plan.get("ema"), None
+        self.decay: float = self.plan["decay"]
+        self.clip: float | None = self.plan.get("clip_norm")
+        self.ema: float | None = self.plan.get("ema")
+        self.average: dict[str, Tensor] | None = None
         self.losses = torch.zeros((), device=self.device)
-        self.forward = self.network
+        self.parallel: nn.parallel.DistributedDataParallel | None = None
         if world > 1:
             backend = "nccl" if task["gpus"] else "gloo"
             distributed.init_process_group(backend)
-            self.forward = nn.parallel.DistributedDataParallel(
+            self.parallel = nn.parallel.DistributedDataParallel(
                 self.network,
                 broadcast_buffers=False,
                 gradient_as_bucket_view=True,
                 find_unused_parameters=spec["architecture"] in MAY_LEAVE_OUT,
             )
-        self.parallel = self.forward
-        if task["compile"]:
-            self.forward = torch.compile(self.forward)
+        forward = self.parallel or self.network
+        self.forward: Callable[..., Tensor] = torch.compile(forward) if task["compile"] else forward
         self.learns()
 
-    def learns(self):
+    def learns(self) -> None:
         """Switches to training. A frozen encoder stays in evaluation."""
         self.network.train()
         for part in self.frozen:
@@ -161,10 +177,11 @@ class Learner:
         norms = [m for m in every if isinstance(m, nn.modules.batchnorm._BatchNorm)]
         self.norms = [norm for norm in norms if norm.training]
 
-    def load(self, path, steps):
+    def load(self, path: str, steps: int) -> None:
         """Takes over a state after so many steps."""
         state, here = read_state(path), self.network.state_dict()
-        parts = {"weights": {}, "average": {}, "adamw.m": {}, "adamw.v": {}}
+        names = ("weights", "average", "adamw.m", "adamw.v")
+        parts: dict[str, dict[str, Tensor]] = {name: {} for name in names}
         for name, tensor in state.items():
             part, name = name.split("/", 1)
             parts[part][name] = tensor.reshape(here[name].shape).to(here[name])
@@ -183,35 +200,35 @@ class Learner:
             }
         self.steps = steps
 
-    def state(self, path, moments):
+    def state(self, path: str, moments: bool) -> None:
         """Writes the weights, and with `moments` also the optimiser's state."""
         tensors = {f"weights/{name}": v for name, v in self.network.state_dict().items()}
         if self.average is not None:
             tensors |= {f"average/{name}": v for name, v in self.average.items()}
-        for name, value in self.learned.items() if moments else ():
+        for name, value in (self.learned if moments else {}).items():
             state = self.optimiser.state[value]
             tensors[f"adamw.m/{name}"] = state["exp_avg"]
             tensors[f"adamw.v/{name}"] = state["exp_avg_sq"]
         write_state(path, tensors)
 
-    def computing(self):
+    def computing(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.half)
 
-    def add(self, batch, first, last):
+    def add(self, batch: Batch, first: bool, last: bool) -> None:
         """Adds the gradients of a batch to those of the step. Running statistics follow the first
         batch of a step."""
         for norm in self.norms:
             norm.track_running_stats = first
-        alone = self.world == 1 or last
-        with contextlib.nullcontext() if alone else self.parallel.no_sync():
+        waits = None if last else self.parallel
+        with contextlib.nullcontext() if waits is None else waits.no_sync():
             with self.computing():
                 output = self.forward(*batch.inputs())
-            value = loss(self.target, output.float(), batch.target)
+            value = loss(self.target, output.float(), batch.truth())
             # The gradients of all processes are averaged.
             (value * (self.world / self.plan["accumulate"])).backward()
         self.losses += value.detach()
 
-    def step(self, rate, beta):
+    def step(self, rate: float, beta: float) -> float | None:
         """Takes a step of the optimiser, and returns the mean loss of its batches."""
         if self.clip is not None:
             nn.utils.clip_grad_norm_(self.learned.values(), self.clip)
@@ -228,22 +245,21 @@ class Learner:
         # JSON has no other numbers.
         return mean if math.isfinite(mean) else None
 
-    @torch.no_grad()
-    def follow(self):
+    def follow(self) -> None:
         """Updates the average after a step."""
-        if self.average is None:
+        if self.average is None or self.ema is None:
             return
         decay = min(self.ema, (1 + self.steps) / (10 + self.steps))
-        for name, value in self.network.state_dict().items():
-            self.average[name].mul_(decay).add_(value.float(), alpha=1 - decay)
+        with torch.no_grad():
+            for name, value in self.network.state_dict().items():
+                self.average[name].mul_(decay).add_(value.float(), alpha=1 - decay)
 
-    @torch.no_grad()
-    def predict(self, batch):
+    def predict(self, batch: Batch) -> Tensor:
         """Returns the output in evaluation, by the average if there is one."""
         self.network.eval()
         for norm in self.norms:
             norm.track_running_stats = True
-        with self.computing():
+        with torch.no_grad(), self.computing():
             if self.average is None:
                 output = self.network(*batch.inputs())
             else:
@@ -256,15 +272,23 @@ class Learner:
 class Program:
     """Answers the commands of the worker."""
 
-    def __init__(self, connection):
-        self.connection, self.files, self.learner = connection, {}, None
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.files: dict[str, mmap.mmap] = {}
+        self.begun: Learner | None = None
         self.rank = int(os.environ.get("RANK", "0"))
         self.world = int(os.environ.get("WORLD_SIZE", "1"))
 
-    def say(self, answer):
+    def say(self, answer: Mapping[str, Any]) -> None:
         self.connection.sendall(json.dumps(answer).encode() + b"\n")
 
-    def batch(self, command):
+    @property
+    def learner(self) -> Learner:
+        if self.begun is None:
+            raise ValueError("do: the first command must be 'begin'")
+        return self.begun
+
+    def batch(self, command: Mapping[str, Any]) -> Batch:
         path, size = command["file"], command["bytes"]
         content = self.files.get(path)
         if content is None or len(content) < size:
@@ -272,11 +296,13 @@ class Program:
         one_hot = self.learner.plan["net"]["one_hot"]
         return Batch(content, command, one_hot, self.learner.device)
 
-    def answer(self, command):
-        learner, what = self.learner, command["do"]
+    def answer(self, command: Mapping[str, Any]) -> dict[str, Any]:
+        what = command["do"]
         if what == "begin":
-            self.learner = Learner(command["task"], self.rank, self.world)
-        elif what == "load":
+            self.begun = Learner(command["task"], self.rank, self.world)
+            return {}
+        learner = self.learner
+        if what == "load":
             learner.load(command["path"], command["steps"])
         elif what == "state":
             learner.state(command["path"], command["moments"])
@@ -294,7 +320,7 @@ class Program:
             raise ValueError(f"do: {what!r} is no command")
         return {}
 
-    def versions(self):
+    def versions(self) -> dict[str, Any]:
         cuda = torch.version.cuda if torch.cuda.is_available() else None
         return {
             "python": platform.python_version(),
@@ -303,7 +329,7 @@ class Program:
         }
 
 
-def listen(connection, commands):
+def listen(connection: socket.socket, commands: queue.SimpleQueue[dict[str, Any]]) -> NoReturn:
     """Passes commands on. The program ends when the worker does, whatever it computes."""
     with connection.makefile("rb") as lines:
         for line in lines:
@@ -311,11 +337,11 @@ def listen(connection, commands):
     os._exit(0)
 
 
-def main():
+def main() -> NoReturn:
     """Serves the worker."""
     connection = socket.socket(socket.AF_UNIX)
     connection.connect(os.environ["PICOFARM_TORCH_SOCKET"])
-    commands = queue.SimpleQueue()
+    commands: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     threading.Thread(target=listen, args=(connection, commands), daemon=True).start()
     program = Program(connection)
     program.say({"rank": program.rank, "versions": program.versions()})
@@ -328,18 +354,18 @@ def main():
             raise
 
 
-def start():
+def start() -> None:
     """Serves the worker with one process, or with a group of several."""
     processes = int(os.environ["PICOFARM_TORCH_PROCESSES"])
     if processes == 1:
         return main()
-    from torch.distributed.run import main as run
+    from torch.distributed import run
 
     paths = (sys.path[0], os.environ.get("PYTHONPATH"))
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     # All processes are on this machine.
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
-    run(["--standalone", "--nproc-per-node", str(processes), "-m", __name__])
+    run.main(["--standalone", "--nproc-per-node", str(processes), "-m", __name__])
 
 
 if __name__ == "__main__":

@@ -1,17 +1,21 @@
 """U-Nets of Shoot-Bounce-3D. Parameters have the names of the released code."""
 
-# pyright: basic
+# PyTorch states some of its types only in part.
+# pyright: reportUnknownMemberType=false
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 
 class SingleConv(nn.Sequential):
     """Convolution, batch norm and ReLU."""
 
-    def __init__(self, inputs, outputs, three=False):
+    def __init__(self, inputs: int, outputs: int, three: bool = False) -> None:
         super().__init__()
         conv, norm = (nn.Conv3d, nn.BatchNorm3d) if three else (nn.Conv2d, nn.BatchNorm2d)
         self.add_module("conv", conv(inputs, outputs, 3, padding=1, bias=False))
@@ -22,28 +26,28 @@ class SingleConv(nn.Sequential):
 class Block(nn.Module):
     """Two convolutions of a level."""
 
-    def __init__(self, inputs, outputs, encoder, three=False):
+    def __init__(self, inputs: int, outputs: int, encoder: bool, three: bool = False) -> None:
         super().__init__()
         between = max(outputs // 2, inputs) if encoder else outputs
         self.basic_module = nn.Sequential()
         self.basic_module.add_module("SingleConv1", SingleConv(inputs, between, three))
         self.basic_module.add_module("SingleConv2", SingleConv(between, outputs, three))
 
-    def forward(self, x):
+    def forward(self, x: Tensor) -> Tensor:
         return self.basic_module(x)
 
 
 class Decoding(nn.Module):
     """The two-dimensional decoder of both U-Nets."""
 
-    def declare(self, widths, outputs):
+    def declare(self, widths: list[int], outputs: int) -> None:
         pairs = list(zip(widths, widths[1:]))[::-1]
         self.decoders = nn.ModuleList(
             Block(fine + coarse, fine, encoder=False) for fine, coarse in pairs
         )
         self.final_conv = nn.Conv2d(widths[0], outputs, 1)
 
-    def decode(self, features):
+    def decode(self, features: list[Tensor]) -> Tensor:
         x = features.pop()
         for block in self.decoders:
             skip = features.pop()
@@ -54,7 +58,7 @@ class Decoding(nn.Module):
 class Unet2d(Decoding):
     """U-Net over images whose channels are the bins (Shoot-Bounce-3D, released code)."""
 
-    def __init__(self, spec):
+    def __init__(self, spec: Mapping[str, Any]) -> None:
         super().__init__()
         inputs = spec["dense"] + spec["one_hot"]
         widths = [spec["width"] << k for k in range(spec["levels"])]
@@ -71,7 +75,7 @@ class Unet2d(Decoding):
         self.declare(widths, spec["outputs"])
         self.frozen = spec.get("frozen", False)
 
-    def train(self, mode=True):
+    def train(self, mode: bool = True) -> Unet2d:
         super().train(mode)
         if self.frozen:
             for part in (self.encoders, self.stem):
@@ -79,11 +83,11 @@ class Unet2d(Decoding):
                     part.eval().requires_grad_(False)
         return self
 
-    def forward(self, dense, one_hot=None):
+    def forward(self, dense: Tensor, one_hot: Tensor | None = None) -> Tensor:
         x = dense if one_hot is None else torch.cat((dense, one_hot), 1)
         if self.stem is not None:
             x = self.stem(x)
-        features = []
+        features: list[Tensor] = []
         for i, block in enumerate(self.encoders):
             x = block(F.max_pool2d(x, 2) if i else x)
             features.append(x)
@@ -100,9 +104,9 @@ class Unet25d(Decoding):
     """
 
     # Appendix B: the moments of a level, and the widths of its layers.
-    OVER_TIME = {160: (128, 32, 1), 80: (64, 32, 1), 40: (32, 1), 20: (16, 1)}
+    OVER_TIME: Mapping[int, tuple[int, ...]] = {160: (128, 32, 1), 80: (64, 32, 1), 40: (32, 1), 20: (16, 1)}
 
-    def __init__(self, spec):
+    def __init__(self, spec: Mapping[str, Any]) -> None:
         super().__init__()
         moments, levels = spec["time"], spec["levels"]
         streams = 2 if spec["one_hot"] else 1
@@ -123,7 +127,7 @@ class Unet25d(Decoding):
         self.declare(widths, spec["outputs"])
 
     @classmethod
-    def over_time(cls, moments):
+    def over_time(cls, moments: int) -> nn.Sequential:
         if moments in cls.OVER_TIME:
             widths = cls.OVER_TIME[moments]
         elif moments <= 2:
@@ -132,21 +136,22 @@ class Unet25d(Decoding):
             # The same rule for other lengths: the greatest smaller power of two, 32, one.
             power = max(p for p in (1 << k for k in range(13)) if p < moments)
             widths = (power, 32, 1) if power > 32 else (power, 1)
-        layers, last = [], moments
+        layers: list[nn.Module] = []
+        last = moments
         for width in widths:
             layers += [nn.ReLU(), nn.Linear(last, width)]
             last = width
         return nn.Sequential(*layers[1:])
 
-    def to_moments(self, streams):
+    def to_moments(self, streams: list[Tensor]) -> list[Tensor]:
         if hasattr(self, "time_projection"):
             return [self.time_projection(stream) for stream in streams]
         return [layer(stream) for layer, stream in zip(self.time_projections, streams)]
 
-    def forward(self, dense, one_hot=None):
+    def forward(self, dense: Tensor, one_hot: Tensor | None = None) -> Tensor:
         streams = [dense] if one_hot is None else [dense, one_hot]
         volume = torch.stack(self.to_moments(streams), dim=1)  # N, streams, T, H, W
-        features = []
+        features: list[Tensor] = []
         for level, block in enumerate(self.encoders):
             volume = block(F.max_pool3d(volume, 2) if level else volume)
             flat = self.skip_projections[level](volume.permute(0, 1, 3, 4, 2))

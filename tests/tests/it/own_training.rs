@@ -4,7 +4,7 @@
 
 use std::{fs, path::Path};
 
-use picofarm_tests::{Farm, Process, Signal, wait::until};
+use picofarm_tests::{Farm, Process, Signal, wait::until, wheels};
 use serde_json::Value;
 
 /// Fits a line by gradient descent, slowly enough for the death of a worker.
@@ -236,4 +236,63 @@ fn a_failure_of_the_code_is_the_jobs_and_a_worker_that_stops_saves_first() {
     let two = worker(&farm, "two", &python);
     assert_eq!(farm.until_ended(&id)["state"], "done");
     assert!(two.stderr().contains("goes on from the checkpoint"));
+}
+
+#[test]
+fn a_worker_installs_what_the_code_requires() {
+    let Some(python) = python("environments") else {
+        return;
+    };
+    let mut farm = Farm::with_lease("own-environment", 2.0);
+    let store = farm.store();
+    let Some(variables) = wheels::write(python.as_ref(), farm.scratch.path()) else {
+        return;
+    };
+    allow(&mut farm);
+    let file = write(
+        &farm,
+        "required",
+        &format!(
+            r#"
+name = "required"
+[[stage]]
+kind = "python"
+[stage.python]
+file = "train.py"
+model = "versions"
+store = {store:?}
+requirements = ["user==1.0", "tiny==2.0"]
+"#
+        ),
+    );
+    let code = Path::new(&file).with_file_name("train.py");
+    let script = "import user, tiny\nfrom picofarm import run\nrun.report(step=1, version=float(tiny.VERSION))\n";
+    fs::write(code, script).unwrap();
+    let id = farm.json(&["job", "submit", &file])["job"]
+        .as_str()
+        .unwrap()
+        .to_owned();
+
+    let folder = farm.scratch.join("environments");
+    let args = [
+        "worker",
+        "--threads",
+        "1",
+        "--coordinator",
+        farm.url(),
+        "--python",
+        &python,
+    ];
+    let more = ["--python-environments", folder.to_str().unwrap()];
+    let cli = variables
+        .iter()
+        .fold(farm.cli(), |cli, (name, value)| cli.with(name, value));
+    let _worker = cli.start("installing", &[&args[..], &more].concat());
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    let shown = farm.json(&["model", "show", store.to_str().unwrap(), "versions"]);
+    let metrics = &shown["manifest"]["metrics"];
+    assert_eq!(metrics["latest"]["version"], 2.0, "{metrics}");
+    let versions = &metrics["environment"]["versions"];
+    assert_eq!(versions["tiny"], "2.0", "{metrics}");
+    assert_eq!(versions["user"], "1.0", "{metrics}");
 }

@@ -44,6 +44,8 @@ pub struct AgentConfig {
     pub asset_dirs: Vec<PathBuf>,
     /// The Python that runs code of jobs; `None` = the worker runs none.
     pub python: Option<PathBuf>,
+    /// Folder of virtual environments for that code; `None` = nothing is installed.
+    pub python_environments: Option<PathBuf>,
     /// The worker's credentials, and the certificate authorities it trusts.
     pub access: Access,
     /// Paths or URLs that must contain tasks' outputs and scene files; without any, all places are

@@ -20,7 +20,7 @@ use picofarm_settings::Gpus;
 use tokio::runtime::Handle;
 
 #[cfg(feature = "networks")]
-use crate::{device, interpreter::Interpreter, kinds::train::has_torch};
+use crate::{device, interpreter::Interpreter, kinds::train::has_torch, python};
 use crate::{
     examine,
     input::scenes,
@@ -143,6 +143,8 @@ impl TaskExecutor {
             models: Latest::default(),
             #[cfg(feature = "networks")]
             python: None,
+            #[cfg(feature = "networks")]
+            environments: None,
         })
     }
 
@@ -186,12 +188,17 @@ impl TaskExecutor {
     }
 
     /// Runs Python code of jobs with this interpreter. Without one, no such tasks are accepted.
+    /// With a folder of environments, the packages that a job requires are installed there.
     ///
     /// # Errors
-    /// [`AgentError::Config`] if the interpreter cannot be used, or this program was built without
-    /// networks.
+    /// [`AgentError::Config`] if the interpreter or the folder cannot be used, or this program was
+    /// built without networks.
     #[cfg_attr(not(feature = "networks"), expect(unused_mut))]
-    pub fn with_python(mut self, python: Option<&Path>) -> Result<Self, AgentError> {
+    pub fn with_python(
+        mut self,
+        python: Option<&Path>,
+        environments: Option<&Path>,
+    ) -> Result<Self, AgentError> {
         let Some(path) = python else {
             return Ok(self);
         };
@@ -209,13 +216,20 @@ impl TaskExecutor {
             );
             self.0.torch = has_torch(&found).then(|| found.clone());
             self.0.python = Some(found);
+            self.0.environments = match environments {
+                Some(folder) => Some(python::open_environments(folder)?),
+                None => None,
+            };
             Ok(self)
         }
         #[cfg(not(feature = "networks"))]
-        Err(refused(format!(
-            "{}: this program was built without networks, which own training is a part of",
-            path.display()
-        )))
+        {
+            let _ = environments;
+            Err(refused(format!(
+                "{}: this program was built without networks, which own training is a part of",
+                path.display()
+            )))
+        }
     }
 
     /// Returns whether tasks of a kind can run here.

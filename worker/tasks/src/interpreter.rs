@@ -7,12 +7,17 @@ use std::{
 
 /// Oldest version that runs the worker's own files.
 const OLDEST: [u32; 2] = [3, 10];
+/// Prints the version, and what else an environment depends on.
+const ASKED: &str = "import sys, sysconfig
+print('.'.join(map(str, sys.version_info[:3])))
+print(sys.version, sys.implementation.cache_tag, sys.abiflags, sysconfig.get_platform(), sys.base_prefix)";
 
 /// The Python that runs tasks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Interpreter {
     path: PathBuf,
     version: String,
+    build: String,
 }
 
 impl Interpreter {
@@ -26,13 +31,13 @@ impl Interpreter {
             1 => path.to_owned(),
             _ => std::path::absolute(path).map_err(|e| format!("{}: {e}", path.display()))?,
         };
-        let asked = "import sys; print('.'.join(map(str, sys.version_info[:3])))";
         let ran = Command::new(&path)
-            .args(["-I", "-c", asked])
+            .args(["-I", "-c", ASKED])
             .stdin(Stdio::null())
             .output()
             .map_err(|e| format!("cannot start {}: {e}; name a Python", path.display()))?;
-        let version = String::from_utf8_lossy(&ran.stdout).trim().to_owned();
+        let told = String::from_utf8_lossy(&ran.stdout);
+        let (version, build) = told.trim().split_once('\n').unwrap_or((told.trim(), ""));
         let numbers: Vec<u32> = version.split('.').filter_map(|n| n.parse().ok()).collect();
         if !ran.status.success() || numbers.len() != 3 {
             let what = format!("{} is no Python; name one", path.display());
@@ -42,7 +47,11 @@ impl Interpreter {
             let what = format!("{} is Python {version}; name one from 3.10", path.display());
             return Err(what);
         }
-        Ok(Self { path, version })
+        Ok(Self {
+            path,
+            version: version.to_owned(),
+            build: build.to_owned(),
+        })
     }
 
     /// The path of the program.
@@ -53,5 +62,11 @@ impl Interpreter {
     /// The version, as 3.12.1.
     pub(crate) fn version(&self) -> &str {
         &self.version
+    }
+
+    /// Version, platform and folder of the installation. Interpreters with an equal build can
+    /// share the packages of a virtual environment.
+    pub(crate) fn build(&self) -> &str {
+        &self.build
     }
 }

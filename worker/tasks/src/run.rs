@@ -20,6 +20,9 @@ pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Sum
         .with_memory(config.memory_mib)
         .reached_at(&config.peers)
         .with_gpus(&config.gpus)?
-        .with_python(config.python.as_deref())?;
+        .with_python(
+            config.python.as_deref(),
+            config.python_environments.as_deref(),
+        )?;
     run_with(config, Arc::new(executor), shutdown).await
 }

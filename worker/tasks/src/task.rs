@@ -2,6 +2,8 @@
 
 #[cfg(feature = "networks")]
 use std::collections::BTreeMap;
+#[cfg(feature = "networks")]
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use picofarm_exchange::import::Source;
@@ -65,6 +67,10 @@ pub(crate) struct Context {
     /// The interpreter for Python code of jobs; `None` = such tasks are not accepted.
     #[cfg(feature = "networks")]
     pub python: Option<Interpreter>,
+    /// Folder of virtual environments for that code; `None` = the interpreter must have all that
+    /// a job requires.
+    #[cfg(feature = "networks")]
+    pub environments: Option<PathBuf>,
 }
 
 impl Context {

@@ -7,6 +7,7 @@ use std::{collections::BTreeSet, sync::Arc};
 use futures::future::join_all;
 use maud::{Markup, html};
 use picofarm_figures::number::thousands;
+use picofarm_proto::spec::kinds::{Declared as _, PythonTask};
 use picofarm_results::{Evaluation, ModelManifest, Verdict};
 use picofarm_store::published::Manifest as _;
 use serde_json::Value;
@@ -192,7 +193,12 @@ fn facts(store: &str, model: &Model) -> Markup {
             @for (name, value) in model.manifest.metrics.as_object().into_iter().flatten() {
                 dt { (safe(name)) } dd { (safe(plain(value))) }
             }
-            dt { "code, seed" } dd { (safe(&from.code)) ", " (from.seed) }
+            @if model.manifest.kind == PythonTask::NAME {
+                // The farm knows no seed of own code.
+                dt { "code" } dd { (safe(&from.code)) }
+            } @else {
+                dt { "code, seed" } dd { (safe(&from.code)) ", " (from.seed) }
+            }
             dt { "manifest" } dd { code { "SHA-256 " (model.sha256) } }
             dt { "size" } dd { (bytes(model.manifest.total_bytes())) }
             @if !model.sweeps.is_empty() { dt { "sweeps" } dd {

@@ -30,6 +30,8 @@ pub const CODE_BYTES: usize = 1 << 20;
 pub const CODE_FILES: usize = 256;
 /// Most bytes of the compressed code in a job.
 const PACKED_BYTES: usize = 512 << 10;
+/// What precedes a hash of a requirement.
+const HASH: &str = "--hash=sha256:";
 /// Most parameters, and most requirements.
 const LIST: usize = 256;
 
@@ -72,7 +74,9 @@ pub struct PythonSettings {
     /// Values for the code, by name: `run.parameters`.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub parameters: BTreeMap<String, Value>,
-    /// Distributions that the worker's Python must have installed, each as `name==version`.
+    /// Distributions that the code needs, each as `name==version`. ` --hash=sha256:…` may follow,
+    /// then every distribution that is installed needs one. A worker with
+    /// `--python-environments` installs them, for others their Python must have them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub requirements: Vec<String>,
     /// The metric by which models are compared. A sweep needs it.
@@ -313,12 +317,7 @@ impl PythonSettings {
             (0, LIST as u64),
             "requirements",
         )?;
-        for (i, requirement) in self.requirements.iter().enumerate() {
-            if !is_pinned(requirement) {
-                let what = format!("{requirement:?} is not pinned; write name==version");
-                return fail(&format!("requirements[{i}]"), what);
-            }
-        }
+        self.check_requirements()?;
         if !self.objective.is_empty() {
             check_model("python.objective", &self.objective)?;
         }
@@ -340,6 +339,31 @@ impl PythonSettings {
             Some(trial) => self.check_trial(trial),
             None => Ok(()),
         }
+    }
+
+    fn check_requirements(&self) -> Result<(), SpecError> {
+        let hashed = self.requirements.iter().any(|r| r.contains(HASH));
+        for (i, requirement) in self.requirements.iter().enumerate() {
+            let fail = |what: String| {
+                let field = format!("python.requirements[{i}]");
+                Err(SpecError::new(field, format!("{requirement:?} {what}")))
+            };
+            let mut parts = requirement.split(' ');
+            if !parts.next().is_some_and(is_pinned) {
+                return fail("is not pinned; write name==version".into());
+            }
+            let mut hashes = parts.map(|part| part.strip_prefix(HASH).unwrap_or_default());
+            let hex = |hash: &str| hash.len() == 64 && hash.bytes().all(|b| b.is_ascii_hexdigit());
+            if !hashes.all(hex) {
+                return fail(format!(
+                    "may only go on with {HASH} and 64 hexadecimal digits"
+                ));
+            }
+            if hashed && !requirement.contains(HASH) {
+                return fail(format!("has no {HASH}…, but others have; give each one"));
+            }
+        }
+        Ok(())
     }
 
     fn check_code(&self) -> Result<(), SpecError> {
@@ -427,11 +451,27 @@ mod tests {
 
     #[test]
     fn a_stage_is_checked_and_its_errors_name_the_field() {
-        task(json!({"requirements": ["torch==2.9.0", "numpy==2.0.1+cpu"]}))
-            .unwrap()
-            .check()
-            .unwrap();
+        let hashed = format!("numpy==2.0.1 --hash=sha256:{}", "0a".repeat(32));
+        for requirements in [
+            json!(["torch==2.9.0", "numpy==2.0.1+cpu"]),
+            json!([
+                hashed,
+                format!("{hashed} --hash=sha256:{}", "1b".repeat(32))
+            ]),
+        ] {
+            let pinned = task(json!({"requirements": requirements})).unwrap();
+            pinned.check().unwrap();
+        }
         for (more, what) in [
+            (
+                json!({"requirements": ["a==1", hashed]}),
+                "python.requirements[0]: \"a==1\" has no --hash",
+            ),
+            (
+                json!({"requirements": ["a==1 --hash=sha256:00"]}),
+                "may only go on with --hash",
+            ),
+            (json!({"requirements": ["a==1 "]}), "may only go on"),
             (
                 json!({"requirements": ["torch"]}),
                 "python.requirements[0]: \"torch\" is not pinned",
@@ -439,7 +479,7 @@ mod tests {
             (json!({"requirements": ["torch>=2"]}), "is not pinned"),
             (
                 json!({"requirements": ["a==1 --index-url x"]}),
-                "is not pinned",
+                "may only go on with --hash",
             ),
             (json!({"store": ""}), "python.store: is missing"),
             (json!({"entry": "a:b:c"}), "python.entry"),

@@ -13,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 use super::sample::Sample;
 use crate::args::Store as StoreArgs;
 use picofarm_cli::{
+    args::OwnPython,
     client::{
         Client,
         follow::{Show, follow, verdict},
@@ -94,7 +95,7 @@ async fn render(
     let mut farm = Local::start(
         &catalog,
         any,
-        (1, &[], None),
+        (1, &[], &OwnPython::default()),
         settings,
         Guarded::default(),
         None,

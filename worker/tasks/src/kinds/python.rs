@@ -9,6 +9,8 @@ mod inputs;
 mod recorder;
 mod results;
 
+use std::path::Path;
+
 use picofarm_proto::spec::{SpecError, kinds::PythonTask};
 use picofarm_results::{ModelManifest, Models};
 use picofarm_store::StorageError;
@@ -21,7 +23,7 @@ use self::{
 use crate::{
     errors::{dataset_error, in_field},
     interpreter::Interpreter,
-    python::{Ended, Order, Patience, run},
+    python::{Ended, Order, Patience, prepare, run},
     saver::Saver,
     stores::Stores,
     submission::Submission,
@@ -54,7 +56,7 @@ impl RunTask for PythonTask {
                 .models(self.store(), control)
                 .map_err(|e| in_field("python.store", e))?,
             inputs,
-            interpreter,
+            runtime: (interpreter, context.environments.as_deref()),
             control,
         };
         let Some(trial) = &self.python.trial else {
@@ -70,6 +72,11 @@ impl RunTask for PythonTask {
         };
         let mut course = Course::new((stores, &training.models), learner, trial);
         if let Some(ended) = course.ended(false, control)? {
+            if task.spec.force {
+                info!(
+                    "the trial is not run again by force: own code could come to another end than the sweep has recorded"
+                );
+            }
             return Ok(adopted(&ended));
         }
         match training.learn(false, Some(&course))? {
@@ -92,7 +99,8 @@ struct OwnTraining<'a> {
     stores: &'a Stores,
     models: Models,
     inputs: Inputs,
-    interpreter: &'a Interpreter,
+    /// The interpreter, and the folder of virtual environments.
+    runtime: (&'a Interpreter, Option<&'a Path>),
     control: &'a Control,
 }
 
@@ -134,16 +142,19 @@ impl OwnTraining<'_> {
         let mut recorder =
             Recorder::new(&self.task.python, saver, (course, self.control), resumed)?;
         let code = code::unpack(&self.task.python)?;
+        let requirements = &*self.task.python.requirements;
+        let prepared = prepare(self.runtime, requirements, self.control)?;
         let order = Order {
             entry: self.task.python.entry.clone(),
             code: &code,
-            requirements: &self.task.python.requirements,
+            requirements,
             task: self.inputs.task(&self.task.python),
             checkpoint,
-            variables: Vec::new(),
+            built: prepared.built,
+            variables: prepared.variables,
         };
         let ran = run(
-            self.interpreter,
+            &prepared.interpreter,
             order,
             &mut recorder,
             (self.control, Patience::default()),

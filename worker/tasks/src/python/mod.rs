@@ -7,10 +7,13 @@
 //! The worker brings both sides of the conversation along: `_runner.py` and `run.py` are part of
 //! this program, so that they fit whichever picofarm the interpreter has installed, or none.
 //!
+//! A worker with a folder for environments first installs what a stage requires ([`environment`]).
+//!
 //! The runner's first process supervises: when its connection closes, because the worker ended it
 //! or died itself, it ends every process below it.
 
 mod channel;
+mod environment;
 mod message;
 mod process;
 mod session;
@@ -26,6 +29,7 @@ use bytes::Bytes;
 use serde_json::{Map, Value, json};
 use tempfile::TempDir;
 
+pub(crate) use environment::{open_environments, prepare};
 pub(crate) use message::Report;
 
 use crate::{
@@ -53,6 +57,8 @@ pub(crate) struct Order<'a> {
     pub task: Map<String, Value>,
     /// The checkpoint to resume from, as the process wrote it.
     pub checkpoint: Option<Vec<Bytes>>,
+    /// Whether the interpreter belongs to an environment that was built for the requirements.
+    pub built: bool,
     /// Variables of the process's environment.
     pub variables: Vec<(String, String)>,
 }
@@ -189,6 +195,7 @@ fn write(
     let mut task = order.task;
     task.insert("entry".into(), json!(order.entry));
     task.insert("requirements".into(), json!(order.requirements));
+    task.insert("environment".into(), json!(order.built));
     task.insert("checkpoint".into(), json!(checkpoint));
     task.insert("interpreter".into(), json!(interpreter.path()));
     fs::write(folder.join("task.json"), Value::Object(task).to_string())?;

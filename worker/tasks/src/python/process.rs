@@ -12,10 +12,7 @@ use std::{
 
 use rustix::process::{Pid, Signal, kill_process_group};
 
-use super::{
-    Interpreter,
-    channel::{Event, read_output},
-};
+use super::channel::{Event, read_output};
 
 /// How long the supervisor may take to end its processes once its connection is closed.
 const SUPERVISED_END: Duration = Duration::from_secs(5);
@@ -34,31 +31,29 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts the runner in the folder of a task.
+    /// Starts a program in a folder, without the worker's credentials.
     pub(super) fn start(
-        interpreter: &Interpreter,
-        (folder, variables): (&Path, &[(String, String)]),
+        mut command: Command,
+        folder: &Path,
         sender: &SyncSender<Event>,
     ) -> io::Result<Self> {
         use std::os::unix::process::CommandExt;
-        let mut command = Command::new(interpreter.path());
         let ours = |name: &std::ffi::OsStr| name.to_string_lossy().starts_with(OURS);
-        for (name, _) in std::env::vars_os().filter(|(name, _)| ours(name)) {
+        let given = |name: &std::ffi::OsStr| command.get_envs().any(|(known, _)| known == name);
+        let inherited = std::env::vars_os().map(|(name, _)| name);
+        let hidden: Vec<_> = inherited
+            .filter(|name| ours(name) && !given(name))
+            .collect();
+        for name in hidden {
             command.env_remove(name);
         }
         // Files that a killed process leaves, such as those of torchrun, go with the folder.
         let temporary = folder.join("tmp");
         std::fs::create_dir_all(&temporary)?;
         let mut child = command
-            .arg(folder.join("runner.py"))
-            .env("PICOFARM_RUN", folder)
             .env("TMPDIR", temporary)
             .env("PYTHONUNBUFFERED", "1")
-            .env("PYTHONDONTWRITEBYTECODE", "1")
-            .env("OMP_NUM_THREADS", rayon::current_num_threads().to_string())
-            .envs(variables.iter().map(|(name, value)| (name, value)))
             .current_dir(folder)
-            .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .process_group(0)

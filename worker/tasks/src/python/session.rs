@@ -3,7 +3,7 @@
 use std::{
     os::unix::process::ExitStatusExt,
     path::{Path, PathBuf},
-    process::ExitStatus,
+    process::{Command, ExitStatus, Stdio},
     sync::mpsc::{Receiver, RecvTimeoutError, sync_channel},
     time::{Duration, Instant},
 };
@@ -44,7 +44,15 @@ pub(super) fn serve(
     let (sender, heard) = sync_channel(WAITING);
     let failed = |e: std::io::Error| unprepared(folder, &e);
     let channel = Channel::open(folder, sender.clone()).map_err(failed)?;
-    let process = Process::start(interpreter, (folder, variables), &sender).map_err(failed)?;
+    let mut command = Command::new(interpreter.path());
+    command
+        .arg(folder.join("runner.py"))
+        .env("PICOFARM_RUN", folder)
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .env("OMP_NUM_THREADS", rayon::current_num_threads().to_string())
+        .envs(variables.iter().map(|(name, value)| (name, value)))
+        .stdin(Stdio::null());
+    let process = Process::start(command, folder, &sender).map_err(failed)?;
     drop(sender);
     let mut session = Session {
         folder: folder.canonicalize().map_err(failed)?,
@@ -270,7 +278,8 @@ impl Session<'_> {
                 "python: signal {signal} ended the process (9 may mean that memory ran out); its last lines: {last}"
             )),
             (None, UNMET) => TaskError::Crash(format!(
-                "python: {last}; install it in the interpreter of this worker, or correct python.requirements"
+                "python: {last}; install it in the interpreter of this worker, start the worker with --python-environments DIR, or \
+                 correct python.requirements"
             )),
             (None, 0) => TaskError::User(format!(
                 "python: the process ended without a result, e.g. by os._exit; its last lines: {last}"

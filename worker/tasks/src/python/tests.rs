@@ -104,6 +104,7 @@ impl<'a> Case<'a> {
                 let (head, tail) = bytes.split_at(bytes.len() / 2);
                 [head, tail].map(Bytes::copy_from_slice).to_vec()
             }),
+            built: false,
             variables: vec![("GIVEN".into(), "yes".into())],
         };
         Some(super::run(

@@ -411,6 +411,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         ends_at: None,
         asset_dirs: Vec::new(),
         python: None,
+        python_environments: None,
         access: Default::default(),
         store_prefixes: Vec::new(),
     }
