@@ -4,6 +4,8 @@
 mod deform;
 pub(super) mod document;
 mod draco;
+mod glb;
+mod glossiness;
 mod mask;
 mod material;
 mod mesh;
@@ -440,11 +442,8 @@ impl<'a> Walk<'a> {
         ours: Option<SceneExtras>,
     ) -> Result<Draft, SceneError> {
         let path = self.path;
-        if self.objects.is_empty() && self.points {
-            return Err(format_error(
-                path,
-                "is a point cloud, which has no surface; export a mesh of triangles",
-            ));
+        if let Some(what) = self.why_empty() {
+            return Err(format_error(path, what));
         }
         let count = self.objects.len();
         let mut ids: Vec<Option<u32>> = self.objects.iter().map(|(id, _)| *id).collect();
