@@ -786,6 +786,14 @@ fn scenes_in_gltf() {
             quad("scenes.nodes"),
         ),
         (
+            "a scene below a node outside it",
+            Box::new(|f| {
+                let nodes = f.json["nodes"].as_array_mut().expect("a list");
+                nodes.push(json!({"children": [2], "translation": [0, 0, 9]}));
+            }),
+            quad(""),
+        ),
+        (
             "a child of two nodes",
             Box::new(|f| {
                 f.json["nodes"][0]["children"] = json!([2]);

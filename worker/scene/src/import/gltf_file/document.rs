@@ -54,7 +54,7 @@ pub(super) struct Facts {
     pub(super) sourceless: BTreeSet<usize>,
     /// Whether the file has no scene, so that all nodes were taken for one.
     pub(super) sceneless: bool,
-    /// Whether a scene lists children of other nodes, which are read there alone.
+    /// Whether a scene lists nodes that others of it contain, which are read there alone.
     pub(super) contained: bool,
     /// Whether there are surfaces without positions, which are left out.
     pub(super) placeless: bool,
@@ -196,17 +196,29 @@ fn add_scene(root: &mut json::Root) -> bool {
     true
 }
 
-/// Removes nodes from the list of a scene that are children of other nodes, because they would be
+/// Removes nodes from the list of a scene that others of its nodes contain, because they would be
 /// read twice. Returns whether there were any.
 fn remove_contained(root: &mut json::Root) -> bool {
-    let children = children(root);
     let mut removed = false;
     for scene in &mut root.scenes {
+        let inside = inside(&root.nodes, &scene.nodes);
         let before = scene.nodes.len();
-        scene.nodes.retain(|n| !children.contains(&n.value()));
+        scene.nodes.retain(|n| !inside.contains(&n.value()));
         removed |= scene.nodes.len() < before;
     }
     removed
+}
+
+/// Returns all nodes below the given ones.
+fn inside(nodes: &[json::Node], tops: &[Index<json::Node>]) -> BTreeSet<usize> {
+    let mut open: Vec<usize> = tops.iter().map(Index::value).collect();
+    let mut found = BTreeSet::new();
+    while let Some(node) = open.pop() {
+        let below = nodes.get(node).and_then(|n| n.children.as_ref());
+        let below = below.into_iter().flatten().map(Index::value);
+        open.extend(below.filter(|child| found.insert(*child)));
+    }
+    found
 }
 
 fn children(root: &json::Root) -> BTreeSet<usize> {
