@@ -92,6 +92,56 @@ fn placed(body: Bodies, to_world: &Affine) -> Result<(), String> {
     }
 }
 
+/// Makes thin glass of bodies whose surface has a rim, which therefore enclose no volume. Returns
+/// the names of their objects.
+pub(crate) fn thin_open_bodies(objects: &mut [Object]) -> Vec<String> {
+    let mut known: BTreeMap<*const Mesh, Option<Arc<Mesh>>> = BTreeMap::new();
+    let mut names = Vec::new();
+    for object in objects {
+        let before = Arc::clone(&object.mesh);
+        let thinned = known
+            .entry(Arc::as_ptr(&before))
+            .or_insert_with(|| thinned(&before));
+        if let Some(mesh) = thinned {
+            object.mesh = Arc::clone(mesh);
+            names.push(object.name.clone());
+        }
+    }
+    names
+}
+
+/// Returns the mesh with thin glass for its open bodies, or `None` if it has none.
+fn thinned(mesh: &Mesh) -> Option<Arc<Mesh>> {
+    let corners = mesh.positions.len();
+    if (mesh.triangles.iter().flatten()).any(|v| *v as usize >= corners) {
+        // The scene's check reports it.
+        return None;
+    }
+    let mut changed = None;
+    for (k, material) in mesh.materials.iter().enumerate() {
+        let Bsdf::Dielectric { ior, transmittance } = material.bsdf else {
+            continue;
+        };
+        if has_rim(mesh, k as u32) {
+            let mesh = changed.get_or_insert_with(|| mesh.clone());
+            mesh.materials[k].bsdf = Bsdf::ThinDielectric {
+                ior,
+                transmittance,
+                face: false,
+            };
+        }
+    }
+    changed.map(Arc::new)
+}
+
+fn has_rim(mesh: &Mesh, material: u32) -> bool {
+    let surface = Surface::of_material(mesh, material);
+    let edges = surface.edges();
+    edges
+        .chunk_by(|a, b| (a.0, a.1) == (b.0, b.1))
+        .any(|edge| edge.len() == 1)
+}
+
 /// Returns the glass bodies of a mesh. The error is the index of the material and the fault in its
 /// facets.
 fn of_mesh(mesh: &Mesh) -> Result<Vec<Bodies>, (usize, String)> {
@@ -114,9 +164,7 @@ fn of_mesh(mesh: &Mesh) -> Result<Vec<Bodies>, (usize, String)> {
 /// Returns whether the facets of a material face away from the enclosed volume, or `None` without
 /// facets. Facets of cavities face the other way.
 fn bodies(mesh: &Mesh, material: u32) -> Result<Option<bool>, String> {
-    let facets = mesh.triangles.iter().zip(&mesh.triangle_material);
-    let facets: Vec<[u32; 3]> = facets.filter(|f| *f.1 == material).map(|f| *f.0).collect();
-    let surface = Surface::new(mesh, &facets);
+    let surface = Surface::of_material(mesh, material);
     surface.check_edges()?;
     let parts = surface.parts();
     let larger = |a: &&Part, b: &&Part| a.volume.abs().total_cmp(&b.volume.abs());
@@ -160,6 +208,12 @@ struct Surface {
 }
 
 impl Surface {
+    fn of_material(mesh: &Mesh, material: u32) -> Self {
+        let facets = mesh.triangles.iter().zip(&mesh.triangle_material);
+        let facets: Vec<[u32; 3]> = facets.filter(|f| *f.1 == material).map(|f| *f.0).collect();
+        Self::new(mesh, &facets)
+    }
+
     fn new(mesh: &Mesh, facets: &[[u32; 3]]) -> Self {
         // −0 equals 0.
         let key =
@@ -180,9 +234,9 @@ impl Surface {
         }
     }
 
-    /// Checks that along every edge as many facets go one way as the other.
-    fn check_edges(&self) -> Result<(), String> {
-        // The elements are (lower index, higher index, against this order).
+    /// Returns the edges of all facets in order: lower index, higher index, and whether the facet
+    /// goes against this order.
+    fn edges(&self) -> Vec<(u32, u32, bool)> {
         let mut edges: Vec<(u32, u32, bool)> = self
             .facets
             .iter()
@@ -192,6 +246,12 @@ impl Surface {
             .map(|(a, b)| (a.min(b), a.max(b), a > b))
             .collect();
         edges.sort_unstable();
+        edges
+    }
+
+    /// Checks that along every edge as many facets go one way as the other.
+    fn check_edges(&self) -> Result<(), String> {
+        let edges = self.edges();
         for edge in edges.chunk_by(|a, b| (a.0, a.1) == (b.0, b.1)) {
             let back = edge.iter().filter(|e| e.2).count();
             if 2 * back == edge.len() {

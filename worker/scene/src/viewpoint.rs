@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::{Camera, Intrinsics, Object, Vec3, tree::Tree};
+use crate::{Camera, Intrinsics, Material, Object, Vec3, tree::Tree};
 
 /// The number of directions in which a point's surroundings are probed.
 const PROBES: u32 = 96;
@@ -10,6 +10,9 @@ const PROBES: u32 = 96;
 const ENCLOSED: f32 = 0.95;
 /// and at least this share of those meet a front side. Points inside a solid object meet backs.
 const FRONTS: f32 = 0.7;
+/// The least diagonal of a scene with an indoors, metres. Smaller hollow things, such as a helmet,
+/// are seen from outside.
+const LEAST_ROOM_M: f32 = 1.5;
 /// The nearest surface to a camera indoors, as a share of the scene's diagonal.
 const CLEARANCE: f32 = 0.02;
 /// Candidate positions of a camera indoors, as shares of the scene's extents.
@@ -77,7 +80,9 @@ impl Viewpoint {
             let from = in_front((lo, hi), at, up, intrinsics)?;
             return Ok((look(from, at, up, intrinsics)?, Kind::InFront));
         }
-        if let Some((from, at)) = surroundings.indoors(up) {
+        if (hi - lo).length() >= LEAST_ROOM_M
+            && let Some((from, at)) = surroundings.indoors(up)
+        {
             return Ok((look(from, at, up, intrinsics)?, Kind::Indoors));
         }
         let at = (lo + hi) * 0.5;
@@ -172,10 +177,26 @@ pub(crate) struct Met {
 impl Surroundings {
     /// Builds the tree. Returns `None` without triangles with finite corners.
     pub(crate) fn new(objects: &[Object]) -> Option<Self> {
+        Self::of(objects, |_| true)
+    }
+
+    /// Builds the tree of the surfaces that laser spots appear on: all but glass, or all if there
+    /// is only glass.
+    pub(crate) fn opaque(objects: &[Object]) -> Option<Self> {
+        Self::of(objects, |material| !material.transmits()).or_else(|| Self::new(objects))
+    }
+
+    fn of(objects: &[Object], is_wanted: impl Fn(&Material) -> bool) -> Option<Self> {
         let mut triangles = Vec::new();
         for object in objects {
-            for t in &object.mesh.triangles {
-                let corners = t.map(|v| object.to_world.point(object.mesh.positions[v as usize]));
+            let mesh = &object.mesh;
+            let wanted: Vec<bool> = mesh.materials.iter().map(&is_wanted).collect();
+            for (k, t) in mesh.triangles.iter().enumerate() {
+                let material = mesh.triangle_material.get(k);
+                if material.is_some_and(|&m| wanted.get(m as usize) == Some(&false)) {
+                    continue;
+                }
+                let corners = t.map(|v| object.to_world.point(mesh.positions[v as usize]));
                 if corners.iter().all(|p| p.is_finite()) {
                     triangles.push(corners);
                 }

@@ -5,10 +5,10 @@ use picofarm_settings::{Resolution, Spots};
 
 use crate::{
     Affine, Aim, Camera, Intrinsics, Laser, Object, Provenance, Scene, Vec3,
-    viewpoint::{Surroundings, Viewpoint},
+    viewpoint::{Kind, Surroundings, Viewpoint},
 };
 
-use super::{ImportOptions, Unit, add_note, quoted};
+use super::{ImportOptions, Unit, View, add_note, quoted};
 
 /// The number of spots of a laser that neither the file nor the options describe.
 const SPOTS: u32 = 25;
@@ -51,6 +51,9 @@ impl Draft {
     /// Returns the scene with everything that the renderer needs. The error is the fault, without
     /// the file.
     pub(super) fn complete(mut self, options: &ImportOptions) -> Result<Scene, String> {
+        if self.objects.is_empty() {
+            return Err("has no shapes; add a mesh with faces".into());
+        }
         if self.objects.iter().all(|o| o.mesh.triangles.is_empty()) {
             return Err("has no triangles; export a mesh with faces".into());
         }
@@ -134,7 +137,10 @@ impl Draft {
         };
         let own = own.transpose()?.map(sized);
         let mut camera = match (own, view.from, view.at) {
-            (Some(camera), None, None) => camera,
+            (Some(camera), None, None) => {
+                self.note_first_camera(view);
+                camera
+            }
             (own, from, at) => {
                 let fov_deg = view.fov_deg.unwrap_or(FOV_DEG);
                 let intrinsics = match own {
@@ -150,18 +156,7 @@ impl Draft {
                     up: view.up.unwrap_or(Vec3::new(0.0, 1.0, 0.0)),
                 };
                 let (camera, kind) = viewpoint.camera(&self.objects, intrinsics)?;
-                if from.is_none() && at.is_none() {
-                    let [x, y, z] = <[f32; 3]>::from(camera.origin);
-                    let ahead = camera.origin + camera.forward;
-                    self.note(
-                        "camera",
-                        format!(
-                            "{kind}, at {x:.3},{y:.3},{z:.3} towards {:.3},{:.3},{:.3}, {fov_deg}° wide, because the file \
-                             has none; --look-from, --look-at, --fov and --up change it",
-                            ahead.x, ahead.y, ahead.z
-                        ),
-                    );
-                }
+                self.note_viewpoint(&viewpoint, &camera, kind, fov_deg);
                 camera
             }
         };
@@ -170,6 +165,42 @@ impl Draft {
             camera.intrinsics = Intrinsics::from_fov(fov_deg, i.width, i.height);
         }
         Ok(camera)
+    }
+
+    /// Notes the use of the first of several cameras.
+    fn note_first_camera(&mut self, view: &View) {
+        if view.camera.is_some() || self.cameras.len() < 2 {
+            return;
+        }
+        let (name, _) = &self.cameras[0];
+        let what = format!(
+            "the first of {}, {}; --camera changes it",
+            self.cameras.len(),
+            quoted(name)
+        );
+        self.note("camera", what);
+    }
+
+    /// Notes what was chosen of a viewpoint.
+    fn note_viewpoint(&mut self, stated: &Viewpoint, camera: &Camera, kind: Kind, fov_deg: f32) {
+        let show = |p: Vec3| {
+            let [x, y, z] = <[f32; 3]>::from(p);
+            format!("{x:.3},{y:.3},{z:.3}")
+        };
+        let from = show(camera.origin);
+        let what = match (stated.from, stated.at) {
+            (Some(_), Some(_)) => return,
+            (Some(_), None) => "towards the middle of the objects; --look-at changes it".to_owned(),
+            (None, Some(_)) => {
+                format!("{kind}, at {from}, because the file has none; --look-from changes it")
+            }
+            (None, None) => format!(
+                "{kind}, at {from} towards {}, {fov_deg}° wide, because the file has none; --look-from, --look-at, \
+                 --fov and --up change it",
+                show(camera.origin + camera.forward)
+            ),
+        };
+        self.note("camera", what);
     }
 
     /// Returns the camera of a name or number (from 0).
@@ -223,9 +254,9 @@ impl Draft {
     }
 }
 
-/// Returns which pixels of a coarse image see a surface, row by row.
+/// Returns which pixels of a coarse image see a surface that shows spots, row by row.
 fn seen(objects: &[Object], camera: &Camera) -> Vec<bool> {
-    let world = Surroundings::new(objects);
+    let world = Surroundings::opaque(objects);
     let i = &camera.intrinsics;
     let centres = (0..RAYS * RAYS).map(|k| [k % RAYS, k / RAYS].map(film));
     centres

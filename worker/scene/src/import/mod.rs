@@ -286,10 +286,20 @@ fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
 /// The greatest size of a file, bytes.
 const MAX_FILE_BYTES: u64 = 8 << 30;
 
+/// The beginning of the text that Git LFS leaves in place of a file that it has not fetched.
+const LFS_POINTER: &[u8] = b"version https://git-lfs.github.com/spec/";
+
 /// Returns a regular file's bytes. The check is necessary because a path inside a scene file may
 /// name anything, devices too.
 fn read_file(files: &Opener, path: &Path) -> Result<Vec<u8>, SceneError> {
-    files.read(path, MAX_FILE_BYTES).map_err(of_file)
+    let bytes = files.read(path, MAX_FILE_BYTES).map_err(of_file)?;
+    match bytes.starts_with(LFS_POINTER) {
+        false => Ok(bytes),
+        true => Err(format_error(
+            path,
+            "is a pointer of Git LFS, not the file itself; run `git lfs pull` in its repository",
+        )),
+    }
 }
 
 fn of_file(error: FileError) -> SceneError {

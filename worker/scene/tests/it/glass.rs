@@ -181,11 +181,6 @@ fn mitsubas_glass_that_is_no_body_is_refused_with_a_way_out() {
     let sphere = r#""type": "sphere""#;
     for (shape, bsdf, expected) in [
         (
-            r#""type": "rectangle""#,
-            r#"{"type": "dielectric"}"#,
-            "in Mitsuba thindielectric) for panes",
-        ),
-        (
             r#""type": "sphere", "flip_normals": true"#,
             r#"{"type": "dielectric"}"#,
             "in Mitsuba set flip_normals",
@@ -222,6 +217,15 @@ fn mitsubas_glass_that_is_no_body_is_refused_with_a_way_out() {
             "{error}"
         );
     }
+}
+
+#[test]
+fn mitsubas_open_glass_is_thin_with_a_note() {
+    let scene = dictionary(r#""type": "rectangle""#, r#"{"type": "dielectric"}"#).expect("reads");
+    let bsdf = stone(&scene).materials[0].bsdf;
+    assert!(matches!(bsdf, Bsdf::ThinDielectric { .. }), "{bsdf:?}");
+    let note = &scene.provenance.notes["import.glass.open"];
+    assert!(note.contains("not closed"), "{note}");
 }
 
 /// Returns the fault of the scene, if the field is that of the glass.

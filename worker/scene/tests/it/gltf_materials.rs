@@ -131,6 +131,37 @@ fn a_metallic_roughness_texture_counts_by_its_means() {
 }
 
 #[test]
+fn an_unlit_material_is_lambertian_whatever_its_metalness() {
+    let material = r#"{"pbrMetallicRoughness":{"baseColorFactor":[0.25,0.5,0.75,1]},
+        "extensions":{"KHR_materials_unlit":{}}}"#;
+    let scene = read(file(
+        material,
+        r#","extensionsUsed":["KHR_materials_unlit"]"#,
+    ));
+    let expected = Bsdf::Diffuse { reflectance: 0.5 };
+    assert_eq!(scene.objects[0].mesh.materials[0].bsdf, expected);
+}
+
+#[test]
+fn a_specular_glossiness_texture_counts_by_its_means() {
+    let material = r#"{"extensions":{"KHR_materials_pbrSpecularGlossiness":{
+        "diffuseFactor":[0.5,0.5,0.5,1],"glossinessFactor":0.5,"specularGlossinessTexture":{"index":0}}}}"#;
+    let of = |png: &[u8]| {
+        let scene = read(file(material, &images(&data_uri(png))));
+        let note = &scene.provenance.notes["import.specular_glossiness_textures"];
+        assert!(note.contains("means"), "{note}");
+        scene.objects[0].mesh.materials[0].bsdf
+    };
+    let dark = picture(ImageFormat::Png, [20; 3], [20; 3]);
+    assert_eq!(of(&dark), Bsdf::Diffuse { reflectance: 0.5 });
+    let half = picture(ImageFormat::Png, [255; 3], [0; 3]);
+    let Bsdf::Mixed { weight, alpha, .. } = of(&half) else {
+        panic!("half metal");
+    };
+    assert!((weight - 0.5).abs() < 1e-6 && (alpha - 0.25).abs() < 1e-6);
+}
+
+#[test]
 fn extensions_are_honoured_or_noted() {
     let glossy = r#"{"extensions":{"KHR_materials_pbrSpecularGlossiness":{"diffuseFactor":[0.5,0.5,0.5,1],
         "specularFactor":[0.4,0.4,0.4],"glossinessFactor":0.5}}}"#;

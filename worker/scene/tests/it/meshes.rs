@@ -132,3 +132,16 @@ fn damaged_stl_is_refused_by_place() {
     let short = binary();
     assert!(read(&[("part.stl", &short[..short.len() - 1])]).is_err());
 }
+
+#[test]
+fn a_file_that_git_lfs_has_not_fetched_is_named() {
+    let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:2c6b\nsize 4285914\n";
+    let scene = r#"<scene version="3.0.0"><shape type="obj"><string name="filename" value="a.obj"/></shape></scene>"#;
+    let lone = [("a.obj", pointer.as_bytes())];
+    let named = [("a.xml", scene.as_bytes()), ("a.obj", pointer.as_bytes())];
+    for files in [&lone[..], &named[..]] {
+        let error = read(files).expect_err("no mesh").to_string();
+        let expected = "a.obj: is a pointer of Git LFS";
+        assert!(error.contains(expected), "{error}");
+    }
+}

@@ -642,7 +642,7 @@ fn scenes_in_gltf() {
                 f.json["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] =
                     json!([1, 1, 1, 0.2]);
             }),
-            Refused("has no triangles"),
+            Refused("alpha masks cut away its whole surface"),
         ),
         ("one vertex colour", colours(0.5), quad("")),
         ("vertex colours", colours(0.9), quad("vertex_colours")),
@@ -745,6 +745,78 @@ fn scenes_in_gltf() {
                 f.json["scenes"][0]["nodes"] = json!([1, 2]);
             }),
             Refused("point cloud"),
+        ),
+        (
+            "nothing but lines",
+            Box::new(|f| {
+                f.primitive()["mode"] = json!(1);
+                f.json["scenes"][0]["nodes"] = json!([1, 2]);
+            }),
+            Refused("has only lines"),
+        ),
+        (
+            "nothing but hidden meshes",
+            Box::new(|f| {
+                f.json["nodes"][2]["extensions"] =
+                    json!({"KHR_node_visibility": {"visible": false}});
+                f.json["scenes"][0]["nodes"] = json!([1, 2]);
+            }),
+            Refused("not visible"),
+        ),
+        (
+            "meshes outside the scene",
+            Box::new(|f| f.json["scenes"][0]["nodes"] = json!([1])),
+            Refused("no node of its scene has a mesh"),
+        ),
+        (
+            "nodes without a scene",
+            Box::new(|f| {
+                let root = f.json.as_object_mut().expect("an object");
+                root.remove("scenes");
+                root.remove("scene");
+            }),
+            quad("scenes"),
+        ),
+        (
+            "a scene that lists a child of its nodes",
+            Box::new(|f| {
+                f.json["nodes"][0]["children"] = json!([2]);
+                f.json["nodes"][2]["translation"] = json!([0, 0, 1]);
+            }),
+            quad("scenes.nodes"),
+        ),
+        (
+            "a scene below a node outside it",
+            Box::new(|f| {
+                let nodes = f.json["nodes"].as_array_mut().expect("a list");
+                nodes.push(json!({"children": [2], "translation": [0, 0, 9]}));
+            }),
+            quad(""),
+        ),
+        (
+            "a child of two nodes",
+            Box::new(|f| {
+                f.json["nodes"][0]["children"] = json!([2]);
+                f.json["nodes"][1]["children"] = json!([2]);
+            }),
+            Refused("more than one parent"),
+        ),
+        (
+            "a surface without positions",
+            Box::new(|f| {
+                let bare = json!({"attributes": {}, "material": 0});
+                let primitives = f.json["meshes"][1]["primitives"].as_array_mut();
+                primitives.expect("a list").push(bare);
+            }),
+            quad("primitives"),
+        ),
+        (
+            "whole numbers with a point",
+            Box::new(|f| {
+                f.primitive()["mode"] = json!(4.0);
+                f.json["scenes"][0]["nodes"] = json!([0.0, 1.0, 2.0]);
+            }),
+            quad(""),
         ),
         (
             "a required extension",

@@ -7,6 +7,7 @@ use picofarm_scene::{
     import::{Bounds, ImportOptions, Unit, View, read_scene_with},
     primitive::{self, PrimitiveSettings},
 };
+use serde_json::json;
 
 /// A closed box with outward (`+1`) or inward (`-1`) facets, as PLY.
 fn cuboid(lo: [f64; 3], hi: [f64; 3], inward: bool) -> String {
@@ -105,6 +106,14 @@ fn an_empty_room_is_seen_from_inside() {
 }
 
 #[test]
+fn a_small_hollow_thing_is_seen_from_outside() {
+    let text = cuboid([0.0; 3], [0.4, 0.5, 0.3], true);
+    let scene = read("a.ply", text.as_bytes(), &ImportOptions::default()).expect("reads");
+    let note = &scene.provenance.notes["chosen.camera"];
+    assert!(note.contains("in front"), "{note}");
+}
+
+#[test]
 fn a_generated_room_without_its_camera_is_seen_from_inside() {
     for seed in 0..6 {
         let room = primitive::generate(seed, &PrimitiveSettings::default()).expect("a room");
@@ -155,6 +164,50 @@ fn a_stated_view_unit_and_laser_are_used_and_not_noted() {
     let chosen = |k: &&String| k.starts_with("chosen.");
     let notes = &scene.provenance.notes;
     assert_eq!(notes.keys().filter(chosen).count(), 0, "{notes:?}");
+}
+
+#[test]
+fn the_unstated_half_of_a_view_is_noted() {
+    let text = cuboid([0.0; 3], [1.0; 3], false);
+    let point = Some(Vec3::new(3.0, 2.0, 4.0));
+    let from = View {
+        from: point,
+        ..View::default()
+    };
+    let at = View {
+        at: point,
+        ..View::default()
+    };
+    for (view, option) in [(from, "--look-at"), (at, "--look-from")] {
+        let options = ImportOptions {
+            view,
+            ..ImportOptions::default()
+        };
+        let scene = read("a.ply", text.as_bytes(), &options).expect("reads");
+        let note = &scene.provenance.notes["chosen.camera"];
+        assert!(note.contains(&format!("{option} changes it")), "{note}");
+    }
+}
+
+#[test]
+fn the_first_of_several_cameras_is_noted() {
+    let camera = |x: f64| json!({"type": "perspective", "fov": 60, "to_world": [[1,0,0,x],[0,1,0,0],[0,0,1,-4],[0,0,0,1]]});
+    let file = json!({
+        "type": "scene", "left": camera(-0.1), "right": camera(0.1), "shape": {"type": "cube"},
+    });
+    let bytes = file.to_string().into_bytes();
+    let scene = read("a.json", &bytes, &ImportOptions::default()).expect("reads");
+    let note = &scene.provenance.notes["chosen.camera"];
+    assert!(note.starts_with("the first of 2, \"left\""), "{note}");
+    let options = ImportOptions {
+        view: View {
+            camera: Some("right".into()),
+            ..View::default()
+        },
+        ..ImportOptions::default()
+    };
+    let scene = read("a.json", &bytes, &options).expect("reads");
+    assert!(!scene.provenance.notes.contains_key("chosen.camera"));
 }
 
 #[test]
@@ -242,5 +295,24 @@ fn chosen_spots_hit_what_the_camera_sees_and_do_not_meet() {
         for b in &beams[k + 1..] {
             assert!((a.direction - b.direction).length() > 1e-3);
         }
+    }
+}
+
+#[test]
+fn chosen_spots_do_not_aim_at_glass() {
+    let pane = |x: f64, bsdf: &str| {
+        json!({"type": "rectangle", "to_world": [[1,0,0,x],[0,1,0,0],[0,0,1,0],[0,0,0,1]],
+            "bsdf": {"type": bsdf}})
+    };
+    let file = json!({
+        "type": "scene", "glass": pane(-1.1, "thindielectric"), "wall": pane(1.1, "diffuse"),
+        "camera": {"type": "perspective", "fov": 60,
+            "to_world": [[-1,0,0,0],[0,1,0,0],[0,0,-1,5],[0,0,0,1]]},
+    });
+    let bytes = file.to_string().into_bytes();
+    let scene = read("a.json", &bytes, &ImportOptions::default()).expect("reads");
+    for beam in &scene.laser.beams {
+        let x = scene.laser.origin.x + beam.direction.x * 5.0 / -beam.direction.z;
+        assert!(x > 0.0, "{:?}", beam.direction);
     }
 }

@@ -4,16 +4,18 @@
 use std::collections::BTreeSet;
 
 use gltf::{
-    Gltf, Semantic,
+    Semantic,
     json::{self, Index, validation::Checked},
 };
 use serde::Deserialize;
 
+use super::glb;
 use crate::import::quoted;
 
 /// The extensions that a file may require: those that are read, and those that only change the
 /// appearance and are noted.
-const REQUIRED: [&str; 17] = [
+const REQUIRED: [&str; 18] = [
+    "CESIUM_RTC",
     "KHR_texture_transform",
     "KHR_lights_punctual",
     "KHR_node_visibility",
@@ -50,6 +52,12 @@ pub(super) struct Facts {
     pub(super) animated: bool,
     /// The textures without a source.
     pub(super) sourceless: BTreeSet<usize>,
+    /// Whether the file has no scene, so that all nodes were taken for one.
+    pub(super) sceneless: bool,
+    /// Whether a scene lists nodes that others of it contain, which are read there alone.
+    pub(super) contained: bool,
+    /// Whether there are surfaces without positions, which are left out.
+    pub(super) placeless: bool,
     /// The images that are neither a uri nor a view with a type.
     pub(super) damaged_images: BTreeSet<usize>,
     /// The translations of nodes in double precision.
@@ -59,24 +67,24 @@ pub(super) struct Facts {
 /// Parses `.glb` or `.gltf` bytes without validation.
 ///
 /// # Errors
-/// The crate's message.
+/// The fault of the container or of the JSON.
 pub(in crate::import) fn parse(bytes: &[u8]) -> Result<Parsed, String> {
     let mut facts = Facts::default();
-    let (root, blob) = match Gltf::from_slice_without_validation(bytes) {
-        Ok(file) => (file.document.into_json(), file.blob),
+    let file = glb::split(bytes)?;
+    let root = match serde_json::from_slice(file.json) {
+        Ok(root) => root,
         Err(why) => {
             facts.animated = true;
-            mended(bytes).ok_or_else(|| why.to_string())?
+            mended(file.json).ok_or_else(|| why.to_string())?
         }
     };
+    let blob = file.bin.map(<[u8]>::to_vec);
     Ok(Parsed { root, blob, facts })
 }
 
-/// Returns the file without animations, which may contain parts unknown to the crate, and with a
-/// list of nodes in every scene.
-fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
-    let glb = gltf::Glb::from_slice(bytes).ok();
-    let text = glb.as_ref().map_or(bytes, |glb| &glb.json);
+/// Returns the JSON without animations, which may contain parts unknown to the crate, with a list
+/// of nodes in every scene, and with whole numbers for those that are written with a point.
+fn mended(text: &[u8]) -> Option<json::Root> {
     let mut value: serde_json::Value = serde_json::from_slice(text).ok()?;
     let root = value.as_object_mut()?;
     root.remove("animations");
@@ -85,12 +93,26 @@ fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
         let nodes = scene.as_object_mut()?.entry("nodes");
         nodes.or_insert_with(|| serde_json::Value::Array(Vec::new()));
     }
+    without_points(&mut value);
     let text = serde_json::to_vec(&value).ok()?;
-    let root = serde_json::from_slice(&text).ok()?;
-    Some((
-        root,
-        glb.and_then(|glb| glb.bin).map(|bin| bin.into_owned()),
-    ))
+    serde_json::from_slice(&text).ok()
+}
+
+/// The numbers below which every whole number is exact.
+const EXACT: f64 = (1u64 << 53) as f64;
+
+/// Replaces numbers such as 3.0 by 3.
+fn without_points(value: &mut serde_json::Value) {
+    match value {
+        serde_json::Value::Array(all) => all.iter_mut().for_each(without_points),
+        serde_json::Value::Object(all) => all.values_mut().for_each(without_points),
+        serde_json::Value::Number(n) if n.is_f64() => {
+            if let Some(x) = n.as_f64().filter(|x| x.fract() == 0.0 && x.abs() < EXACT) {
+                *n = (x as i64).into();
+            }
+        }
+        _ => {}
+    }
 }
 
 impl Parsed {
@@ -119,6 +141,9 @@ impl Parsed {
         root.extensions_required.clear();
         facts.animated = !root.animations.is_empty() || (facts.animated && has_animations(bytes));
         root.animations.clear();
+        facts.sceneless = add_scene(root);
+        facts.contained = remove_contained(root);
+        facts.placeless = remove_placeless(root);
         for (k, texture) in root.textures.iter_mut().enumerate() {
             if texture.source.value() == u32::MAX as usize
                 && let Some(image) = other_image(texture)
@@ -152,6 +177,66 @@ impl Parsed {
             .map_err(|e| format!("is not readable glTF 2.0 ({e}); copy or export it again"))?;
         Ok((document, self.facts))
     }
+}
+
+/// Adds a scene of all nodes to a file without one. Returns whether it did.
+fn add_scene(root: &mut json::Root) -> bool {
+    if !root.scenes.is_empty() || root.nodes.is_empty() {
+        return false;
+    }
+    let children = children(root);
+    let tops = (0..root.nodes.len()).filter(|k| !children.contains(k));
+    let nodes = tops.map(|k| Index::new(k as u32)).collect();
+    root.scenes.push(json::Scene {
+        extensions: None,
+        extras: Default::default(),
+        name: None,
+        nodes,
+    });
+    true
+}
+
+/// Removes nodes from the list of a scene that others of its nodes contain, because they would be
+/// read twice. Returns whether there were any.
+fn remove_contained(root: &mut json::Root) -> bool {
+    let mut removed = false;
+    for scene in &mut root.scenes {
+        let inside = inside(&root.nodes, &scene.nodes);
+        let before = scene.nodes.len();
+        scene.nodes.retain(|n| !inside.contains(&n.value()));
+        removed |= scene.nodes.len() < before;
+    }
+    removed
+}
+
+/// Returns all nodes below the given ones.
+fn inside(nodes: &[json::Node], tops: &[Index<json::Node>]) -> BTreeSet<usize> {
+    let mut open: Vec<usize> = tops.iter().map(Index::value).collect();
+    let mut found = BTreeSet::new();
+    while let Some(node) = open.pop() {
+        let below = nodes.get(node).and_then(|n| n.children.as_ref());
+        let below = below.into_iter().flatten().map(Index::value);
+        open.extend(below.filter(|child| found.insert(*child)));
+    }
+    found
+}
+
+fn children(root: &json::Root) -> BTreeSet<usize> {
+    let children = root.nodes.iter().flat_map(|n| n.children.iter().flatten());
+    children.map(Index::value).collect()
+}
+
+/// Removes surfaces without positions. Returns whether there were any.
+fn remove_placeless(root: &mut json::Root) -> bool {
+    let position = Checked::Valid(Semantic::Positions);
+    let mut removed = false;
+    for mesh in &mut root.meshes {
+        let before = mesh.primitives.len();
+        mesh.primitives
+            .retain(|p| p.attributes.contains_key(&position));
+        removed |= mesh.primitives.len() < before;
+    }
+    removed
 }
 
 /// Returns the image of a texture whose format an extension allows: WebP or KTX2.
@@ -196,21 +281,15 @@ pub(super) fn is_version_1(bytes: &[u8]) -> bool {
             .is_none_or(|v| v.starts_with('1'))
 }
 
-/// Returns the text of the JSON.
-fn text(bytes: &[u8]) -> Vec<u8> {
-    match gltf::Glb::from_slice(bytes) {
-        Ok(glb) => glb.json.into_owned(),
-        Err(_) => bytes.to_vec(),
-    }
-}
-
 fn has_animations(bytes: &[u8]) -> bool {
     #[derive(Deserialize)]
     struct Root {
         #[serde(default)]
         animations: Vec<serde::de::IgnoredAny>,
     }
-    serde_json::from_slice::<Root>(&text(bytes)).is_ok_and(|r| !r.animations.is_empty())
+    glb::split(bytes).is_ok_and(|file| {
+        serde_json::from_slice::<Root>(file.json).is_ok_and(|r| !r.animations.is_empty())
+    })
 }
 
 /// Returns the translations of nodes with all digits, because the crate stores single precision.
@@ -230,7 +309,8 @@ fn translations(bytes: &[u8]) -> Vec<Option<[f64; 3]>> {
         Some(m) => Some([m[12], m[13], m[14]]),
         None => n.translation,
     };
-    serde_json::from_slice::<Root>(&text(bytes))
+    let json = glb::split(bytes).map_or(&[][..], |file| file.json);
+    serde_json::from_slice::<Root>(json)
         .map(|root| root.nodes.into_iter().map(place).collect())
         .unwrap_or_default()
 }

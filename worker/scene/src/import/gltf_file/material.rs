@@ -22,8 +22,6 @@ use super::{Walk, keyed, under};
 const SAME_FACTOR: f32 = 1e-3;
 /// Metalness within this distance of 0 or 1 counts as 0 or 1.
 const PURE: f32 = 0.01;
-/// Specular factors up to this belong to the coat of an ordinary dielectric.
-const DIELECTRIC: f32 = 0.08;
 /// The format of a spectrum in extras.
 const SPECTRUM: &str = r#"[{"nm": 905, "reflectance": 0.7}, …], by ascending nm"#;
 /// Extensions that are used, or noted by name below.
@@ -54,10 +52,10 @@ pub(super) struct Coordinates {
 }
 
 /// A material's parameters, independent of the form in which the file gives them.
-struct Standard<'a> {
-    rgb: [f32; 3],
-    bsdf: Bsdf,
-    texture: Option<gltf::texture::Info<'a>>,
+pub(super) struct Standard<'a> {
+    pub(super) rgb: [f32; 3],
+    pub(super) bsdf: Bsdf,
+    pub(super) texture: Option<gltf::texture::Info<'a>>,
 }
 
 impl Walk<'_> {
@@ -70,6 +68,18 @@ impl Walk<'_> {
         let document = self.document;
         if self.facts.animated {
             self.note("animation", "ignored; nodes and meshes are at rest");
+        }
+        if self.facts.sceneless {
+            self.note("scenes", "the file has none; all its nodes are read");
+        }
+        if self.facts.contained {
+            self.note(
+                "scenes.nodes",
+                "nodes that other nodes contain are read there alone",
+            );
+        }
+        if self.facts.placeless {
+            self.note("primitives", "without positions left out");
         }
         if document.lights().is_some_and(|l| l.len() > 0) {
             self.note("lights", "ignored; only the laser shines");
@@ -112,7 +122,8 @@ impl Walk<'_> {
         let at = format!("materials[{}]", file.index().unwrap_or(0));
         self.dropped_features(file);
         let standard = match file.pbr_specular_glossiness() {
-            Some(pbr) => self.specular_glossiness(&pbr, tint),
+            Some(pbr) => self.specular_glossiness(&pbr, &at, tint)?,
+            None if file.unlit() => unlit(file, tint),
             None => self.metallic_roughness(file, &at, tint)?,
         };
         let mut material =
@@ -317,45 +328,6 @@ impl Walk<'_> {
         })
     }
 
-    fn specular_glossiness<'f>(
-        &mut self,
-        pbr: &gltf::material::PbrSpecularGlossiness<'f>,
-        tint: [f32; 3],
-    ) -> Standard<'f> {
-        let [r, g, b] = tinted(pbr.diffuse_factor(), tint);
-        if pbr.specular_glossiness_texture().is_some() {
-            self.note("specular_glossiness_textures", "ignored; factors used");
-        }
-        let specular = pbr.specular_factor();
-        let most = specular.iter().fold(0.0f32, |a, &b| a.max(b)).min(1.0);
-        if most <= DIELECTRIC {
-            return Standard {
-                rgb: [r, g, b],
-                bsdf: mixed(0.0, 1.0, (r + g + b) / 3.0, 0.0),
-                texture: pbr.diffuse_texture(),
-            };
-        }
-        if pbr.diffuse_texture().is_some() {
-            self.note(
-                "specular_glossiness",
-                "diffuse textures scale the specular part too",
-            );
-        }
-        let rough = 1.0 - pbr.glossiness_factor();
-        let alpha = (rough * rough).max(Material::MIN_ALPHA);
-        let share = specular.iter().sum::<f32>() / 3.0 / most;
-        let mix = |diffuse: f32, specular: f32| (1.0 - most) * diffuse + specular;
-        Standard {
-            rgb: [
-                mix(r, specular[0]),
-                mix(g, specular[1]),
-                mix(b, specular[2]),
-            ],
-            bsdf: mixed(most, alpha, (r + g + b) / 3.0, share),
-            texture: pbr.diffuse_texture(),
-        }
-    }
-
     /// Adds notes on features of a material that our model cannot represent.
     fn dropped_features(&mut self, file: &gltf::Material<'_>) {
         if file.emissive_factor() != [0.0; 3] || file.emissive_strength().is_some() {
@@ -382,7 +354,7 @@ impl Walk<'_> {
         }
     }
 
-    fn texture(
+    pub(super) fn texture(
         &mut self,
         file: &gltf::Texture<'_>,
         at: &str,
@@ -453,8 +425,19 @@ impl<'a> Walk<'a> {
     }
 }
 
+/// Returns the parameters of a material without shading: its colour is taken for a reflectance.
+fn unlit<'f>(file: &gltf::Material<'f>, tint: [f32; 3]) -> Standard<'f> {
+    let pbr = file.pbr_metallic_roughness();
+    let [r, g, b] = tinted(pbr.base_color_factor(), tint);
+    Standard {
+        rgb: [r, g, b],
+        bsdf: mixed(0.0, 1.0, (r + g + b) / 3.0, 0.0),
+        texture: pbr.base_color_texture(),
+    }
+}
+
 /// Returns a factor times the colour of vertices. Factors that rounding has put just above 1 are 1.
-fn tinted([r, g, b, _]: [f32; 4], tint: [f32; 3]) -> [f32; 3] {
+pub(super) fn tinted([r, g, b, _]: [f32; 4], tint: [f32; 3]) -> [f32; 3] {
     let rounded = |x: f32| {
         if (1.0..1.0 + 1e-5).contains(&x) {
             1.0
@@ -482,7 +465,7 @@ pub(super) fn albedo_texture<'a>(file: &gltf::Material<'a>) -> Option<gltf::text
 }
 
 /// Returns a GGX mix, or a pure material near either end.
-fn mixed(weight: f32, alpha: f32, reflectance: f32, specular_reflectance: f32) -> Bsdf {
+pub(super) fn mixed(weight: f32, alpha: f32, reflectance: f32, specular_reflectance: f32) -> Bsdf {
     let distribution = Distribution::Ggx;
     if weight < PURE {
         Bsdf::Diffuse { reflectance }

@@ -4,6 +4,8 @@
 mod deform;
 pub(super) mod document;
 mod draco;
+mod glb;
+mod glossiness;
 mod mask;
 mod material;
 mod mesh;
@@ -145,20 +147,24 @@ fn root<'a>(path: &Path, document: &'a gltf::Document) -> Result<gltf::Scene<'a>
         .ok_or_else(|| format_error(path, "scenes: the file has none; export at least one scene"))
 }
 
-/// Checks that every node has at most one parent, and that the scene's own nodes have none;
-/// otherwise a walk might not end.
+/// Checks that every node of the scene has at most one parent there, and that the scene's own nodes
+/// have none; otherwise a walk might not end.
 fn is_a_forest(
     path: &Path,
     document: &gltf::Document,
     root: &gltf::Scene<'_>,
 ) -> Result<(), SceneError> {
     let mut parents = vec![0u32; document.nodes().len()];
-    let children = document.nodes().flat_map(|n| {
-        let inner: Vec<usize> = n.children().map(|c| c.index()).collect();
-        inner
-    });
-    for node in root.nodes().map(|n| n.index()).chain(children) {
-        parents[node] += 1;
+    let mut open: Vec<Node<'_>> = root.nodes().collect();
+    open.iter().for_each(|n| parents[n.index()] += 1);
+    // Nodes outside the scene do not count. Each node is opened once.
+    while let Some(node) = open.pop() {
+        for child in node.children() {
+            parents[child.index()] += 1;
+            if parents[child.index()] == 1 {
+                open.push(child);
+            }
+        }
     }
     match parents.iter().position(|&n| n > 1) {
         Some(node) => Err(format_error(
@@ -440,11 +446,8 @@ impl<'a> Walk<'a> {
         ours: Option<SceneExtras>,
     ) -> Result<Draft, SceneError> {
         let path = self.path;
-        if self.objects.is_empty() && self.points {
-            return Err(format_error(
-                path,
-                "is a point cloud, which has no surface; export a mesh of triangles",
-            ));
+        if let Some(what) = self.why_empty() {
+            return Err(format_error(path, what));
         }
         let count = self.objects.len();
         let mut ids: Vec<Option<u32>> = self.objects.iter().map(|(id, _)| *id).collect();

@@ -32,6 +32,28 @@ pub(super) fn camera_of(to_world: &Affine, file: &gltf::Camera<'_>) -> Result<Ca
 }
 
 impl Walk<'_> {
+    /// Returns the reason if the scene has no surface.
+    pub(super) fn why_empty(&self) -> Option<&'static str> {
+        let mut meshes = self.objects.iter().map(|(_, object)| &object.mesh);
+        if meshes.any(|mesh| !mesh.triangles.is_empty()) {
+            return None;
+        }
+        let noted = |key: &str| self.notes.contains_key(key);
+        Some(if noted("masks") {
+            "alpha masks cut away its whole surface; lower alphaCutoff in its materials"
+        } else if noted("hidden") {
+            "all its meshes are in nodes that are not visible; show them and export again"
+        } else if self.points {
+            "is a point cloud, which has no surface; export a mesh of triangles"
+        } else if noted("dropped") {
+            "has only lines, which have no surface; export a mesh of triangles"
+        } else if self.document.meshes().len() > 0 {
+            "no node of its scene has a mesh of triangles; add the mesh to the scene and export again"
+        } else {
+            "has no meshes; export a mesh with faces"
+        })
+    }
+
     /// Replaces orthographic cameras, which follow the others. Their pixels look along parallel
     /// lines, which those of a lidar do not.
     pub(super) fn parallel_cameras(&mut self) {

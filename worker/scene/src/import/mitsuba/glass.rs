@@ -84,6 +84,22 @@ impl Reader<'_> {
             ..Material::glass(named(node))
         })
     }
+
+    /// Notes the objects whose glass encloses no volume.
+    pub(super) fn note_thinned(&mut self, names: &[String]) {
+        let Some(first) = names.first() else { return };
+        let others = match names.len() {
+            1 => String::new(),
+            n => format!(" and {} others", n - 1),
+        };
+        self.note(
+            "glass.open",
+            format!(
+                "{}{others}: the surface is not closed, so it is thin glass, without refraction; close it for a body",
+                quoted(first)
+            ),
+        );
+    }
 }
 
 pub(super) fn is_glass(node: &Node) -> bool {

@@ -52,7 +52,9 @@ use std::{
     sync::Arc,
 };
 
-use crate::{Material, Mesh, Object, Provenance, SceneError, Wrap, export::mitsuba::text::Extras};
+use crate::{
+    Material, Mesh, Object, Provenance, SceneError, Wrap, body, export::mitsuba::text::Extras,
+};
 
 use super::complete::{Draft, FileLaser};
 use super::{ImportOptions, Opener, add_note, far, format_error, image::Images, of_file, quoted};
@@ -298,13 +300,8 @@ impl<'a> Reader<'a> {
         if options.camera.is_none() {
             self.move_to_camera(sensors.first())?;
         }
-        let (objects, labels) = self.objects(&shapes)?;
-        if sensors.len() > 1 {
-            self.note(
-                "sensors",
-                "more than one; the first is the camera, unless --camera names another",
-            );
-        }
+        let (mut objects, labels) = self.objects(&shapes)?;
+        self.note_thinned(&body::thin_open_bodies(&mut objects));
         let mut cameras = Vec::new();
         for sensor in &sensors {
             match sensor.kind.as_str() {
