@@ -26,8 +26,8 @@ pub struct FittedGate {
 impl Scene {
     /// Returns the shortest and longest optical path of light of one and two bounces, metres, from
     /// a coarse grid of pixels. Mirrors count as surfaces, glass does not, and shadows are lit, so
-    /// the true range may be a little narrower or wider. Returns `None` if no beam hits anything that the camera
-    /// sees.
+    /// the true range may be a little narrower or wider. Returns `None` if no beam hits anything
+    /// that the camera sees.
     pub fn path_range_m(&self) -> Option<[f64; 2]> {
         let world = Surroundings::opaque(&self.objects)?;
         let hit = |from: Vec3, direction: Vec3| {

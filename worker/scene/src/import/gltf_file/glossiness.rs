@@ -1,5 +1,5 @@
-//! Materials by `KHR_materials_pbrSpecularGlossiness`. The texture of specular colour and glossiness
-//! counts by its means.
+//! Materials by `KHR_materials_pbrSpecularGlossiness`. The texture of specular colour and
+//! glossiness counts by its means.
 
 use gltf::material::PbrSpecularGlossiness;
 
