@@ -113,7 +113,12 @@ pub(crate) fn thin_open_bodies(objects: &mut [Object]) -> Vec<String> {
 /// Returns the mesh with thin glass for its open bodies, or `None` if it has none.
 fn thinned(mesh: &Mesh) -> Option<Arc<Mesh>> {
     let corners = mesh.positions.len();
-    if (mesh.triangles.iter().flatten()).any(|v| *v as usize >= corners) {
+    if mesh
+        .triangles
+        .iter()
+        .flatten()
+        .any(|v| *v as usize >= corners)
+    {
         // The scene's check reports it.
         return None;
     }

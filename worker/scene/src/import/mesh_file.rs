@@ -159,7 +159,13 @@ fn materials(
                 }
             }
         }
-        if file.dissolve.is_some_and(|d| d < 1.0) && !material.is_glass() {
+        if material.is_glass() {
+            notes.add(
+                "glass",
+                "opacity of one half and less: thin glass, light goes straight on or is reflected"
+                    .into(),
+            );
+        } else if file.dissolve.is_some_and(|d| d < 1.0) {
             notes.add("opacity", "of partly transparent materials left out".into());
         }
         Ok(material)

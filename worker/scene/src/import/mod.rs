@@ -213,6 +213,9 @@ pub fn read_scene_with(
 ) -> Result<Scene, SceneError> {
     let bytes = read_file(&bounds.files, path)?;
     let files = &bounds.of_scene(path);
+    if bytes.is_empty() {
+        return Err(format_error(path, "is empty; export the scene again"));
+    }
     let draft = if bytes.starts_with(b"glTF") {
         gltf_file::read(path, &bytes, options, files)?
     } else if ply::is_ply(&bytes) {

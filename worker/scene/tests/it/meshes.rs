@@ -145,3 +145,19 @@ fn a_file_that_git_lfs_has_not_fetched_is_named() {
         assert!(error.contains(expected), "{error}");
     }
 }
+
+#[test]
+fn an_empty_file_is_named() {
+    for name in ["a.stl", "a.obj", "a.glb"] {
+        let error = read(&[(name, b"")]).expect_err("no mesh").to_string();
+        assert!(error.contains(&format!("{name}: is empty")), "{error}");
+    }
+}
+
+#[test]
+fn glass_in_a_material_file_is_noted() {
+    let mtl = MTL.replace("Kd 1 0 0", "Kd 1 0 0\nd 0.25");
+    let scene = read(&[("a.obj", OBJ.as_bytes()), ("paint.mtl", mtl.as_bytes())]).expect("reads");
+    let note = &scene.provenance.notes["import.glass"];
+    assert!(note.contains("thin glass"), "{note}");
+}
