@@ -26,6 +26,10 @@ use picofarm_settings::Resolution;
 
 use crate::{Aim, Camera, Object, Provenance, Scene, SceneError, Vec3};
 
+/// The version of what files become. It is part of the key of every render, so a change of
+/// geometry, materials or chosen views needs a new one.
+pub const IMPORT_VERSION: &str = "files-2";
+
 pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
 
