@@ -33,8 +33,8 @@ const PEAK_PHOTONS: f32 = 400.0;
 pub(crate) const RENDER_SHARE: f32 = 0.95;
 
 /// Returns the version of all code of this program that determines a task's bytes: renderer,
-/// generators, importer and encoder. It is part of every task key, so that a change to any of them renames
-/// the results.
+/// generators, importer and encoder. It is part of every task key, so that a change to any of them
+/// renames the results.
 pub fn renderer_version() -> String {
     format!(
         "{RENDERER_VERSION}/{}/{}/{}/{}",
