@@ -21,7 +21,7 @@ pub(super) fn made(report: &Report) -> String {
     let (shared, own): (Vec<&str>, Vec<&str>) = keys.iter().partition(|key| same(key));
     let mut out = String::new();
     if keys.is_empty() {
-        out.push_str("<p class=\"none\">Nothing is known of these models’ lineage.</p>");
+        out.push_str("<p class=\"none\">These models have no lineage.</p>");
     }
     if !shared.is_empty() {
         out.push_str(

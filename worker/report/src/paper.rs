@@ -27,10 +27,10 @@ impl Published {
 }
 
 /// The note shown with published metrics.
-pub(super) const NOTE: &str = "Published figures are of Shoot-Bounce-3D. They stand only beside experiments of its size: 25 spots, \
-    rooms of 256 × 256 pixels and 637 bins, 87,688 scenes to learn from, networks of width 128 and 6 levels. Others are \
-    compared in order alone. Data sets say how many spots there are and not how they were aimed: spots that were aimed at random pass \
-    for the paper's grid.";
+pub(super) const NOTE: &str = "Published figures are from Shoot-Bounce-3D. They are shown next to experiments of the same size: 25 spots, \
+    rooms of 256 × 256 pixels and 637 bins, 87,688 training scenes, networks of width 128 and 6 levels. Other experiments are \
+    compared only by order. A data set records the number of spots, not their directions, so random spots count as the paper's \
+    grid.";
 
 /// The settings of the paper.
 const SPOTS: u32 = 25;
