@@ -124,7 +124,7 @@ fn the_mesh_lies_on_the_true_surfaces_and_little_floats() {
     let nothing = picofarm_reconstruct::Surface::default();
     std::fs::write(&path, nothing.glb(&made.measured).unwrap()).unwrap();
     let refusal = read_scene(&path).unwrap_err().to_string();
-    assert!(refusal.contains("no triangles"), "{refusal}");
+    assert!(refusal.contains("has no meshes"), "{refusal}");
     assert!(
         made.evidence.contains(&Evidence::None),
         "some nodes are guesses, and said to be"

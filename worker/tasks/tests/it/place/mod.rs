@@ -239,7 +239,9 @@ impl Place {
     }
 
     pub fn report(&self, more: serde_json::Value) -> StageSpec {
-        let mut settings = json!({"name": "main", "models": ["m"], "store": self.store(), "version": model_version()});
+        let version = format!("{}/{}", model_version(), picofarm_report::VERSION);
+        let mut settings =
+            json!({"name": "main", "models": ["m"], "store": self.store(), "version": version});
         for (name, value) in more.as_object().unwrap() {
             settings[name] = value.clone();
         }
