@@ -12,8 +12,8 @@ pub const PATIENCE: Duration = Duration::from_secs(300);
 const SHORT: Duration = Duration::from_millis(20);
 const LONG: Duration = Duration::from_millis(500);
 
-/// Polls until `look` returns a value. Between looks it pauses twice as long as a look took, because
-/// a look that starts a program would otherwise keep a core busy.
+/// Polls until `look` returns a value. Between looks it pauses twice as long as a look took,
+/// because a look that starts a program would otherwise keep a core busy.
 ///
 /// # Panics
 /// If it does not within [`PATIENCE`].
