@@ -153,7 +153,7 @@ fn finish(rows: &[Row]) -> Result<()> {
         false => Err(CliError::new(
             Code::Resource,
             format!(
-                "{} of {} workers: {}",
+                "{} of {} workers failed a check or did not answer: {}",
                 bad.len(),
                 rows.len(),
                 bad.join(", ")
@@ -210,7 +210,10 @@ mod tests {
             assert!(parts.iter().all(|part| line.contains(part)), "{line}");
         }
         let failed = finish(&rows).unwrap_err();
-        assert_eq!(failed.message, "2 of 4 workers: c, d");
+        assert_eq!(
+            failed.message,
+            "2 of 4 workers failed a check or did not answer: c, d"
+        );
         assert!(finish(&rows[..2]).is_ok());
         assert!(finish(&[]).is_err());
     }
